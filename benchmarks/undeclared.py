@@ -92,6 +92,8 @@ class Benchmark:
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
     calibrate: bool = False
     """Fit what p-values come to where nothing is missing, on half of the sets, into sysid/data/null_p.json."""
+    replay: bool = False
+    """Judge all logs that have a verdict again, from the evidence in it."""
     collect: bool = False
     """Only write the figures from the verdicts that are there."""
     work: Path = Path("runs/undeclared")
@@ -121,6 +123,8 @@ def main(settings: Benchmark) -> None:
         look_alikes(settings)
     if settings.calibrate:
         undeclared_figures.calibrate(settings.work / "plant")
+    if settings.replay:
+        contact.replay(settings.work / "plant")
     if settings.collect:
         undeclared_figures.figures(settings.work / "plant", settings.driven)
 

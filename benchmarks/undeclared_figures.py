@@ -247,7 +247,7 @@ def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
     inside, errors = [], []
     for truth, one in cases:
         for effect in one["effects"]:
-            if effect["name"] in truth and effect["name"] in SAME:
+            if effect["name"] in truth and effect["name"] in SAME and effect["parameters"]:
                 parameter, neutral, unit = SAME[effect["name"]]
                 driven, seen = neutral + unit * truth[effect["name"]], effect["parameters"][parameter]
                 inside.append(float(seen["interval"][0] <= driven <= seen["interval"][1]))

@@ -32,34 +32,62 @@ class Forms:
     precision: np.ndarray  # (P, P) of the base parameters
     shape: tuple[int, ...]  # (B, n / B) of the residual
 
-    def left(self, form: float, without: int | None = None, free: int | None = None) -> tuple[float, np.ndarray]:
-        """Least cost where all effects may have other forms, and the residual (B, n / B) there.
+    def left(self, form: float) -> np.ndarray:
+        """(B, n / B) what is left where all effects may have other forms.
 
         Args:
             form: root mean square of all forms of an effect together, as a share of what it changes.
-            without: an effect that is taken away whole: columns around its size say little of a dead zone without it.
-            free: an effect that is there as a whole, in the form of its law, of any size.
         """
-        target, columns = self.target, [self.base]
-        special = without if without is not None else free
-        if special is not None:
-            target = target + self.changes[special]
-        columns += [one for i, one in enumerate(self.sizes) if i != special]
-        columns += [self.changes[free][:, None]] if free is not None else []
-        plain = sum(one.shape[1] for one in columns)
-        columns += [one for i, one in enumerate(self.bent) if i != special]
-        design = np.concatenate(columns, axis=1)
-        prior = np.diag(np.repeat([0.0, form**-2], [plain, design.shape[1] - plain]))
-        prior[: len(self.precision), : len(self.precision)] = self.precision
-        matrix = design.T @ design + prior
-        matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
-        right = design.T @ target
-        solution = np.linalg.solve(matrix, right)
-        return float(target @ target - right @ solution), (target - design @ solution).reshape(self.shape)
+        columns = [self.base, *self.sizes]
+        solution, design = self._solved(columns, self.bent, form, self.target)
+        return (self.target - design @ solution).reshape(self.shape)
 
-    def gain(self, form: float, number: int) -> float:
-        """By how much one of the effects lowers the cost beside other forms of the others."""
-        return max(self.left(form, without=number)[0] - self.left(form, free=number)[0], 0.0)
+    def gain(self, form: float, number: int, groups: Sequence[Sequence[int]]) -> tuple[float, np.ndarray]:
+        """By how much one of the effects, in the form of its law, lowers the cost beside other forms of the others.
+
+        It is taken away whole: columns around its size say little of a dead zone or a limit without it.
+
+        Returns:
+            The gain on all drives, and on each manoeuvre (G,) with all sizes fitted to the others.
+        """
+        target = self.target + self.changes[number]
+        others = [one for i, one in enumerate(self.sizes) if i != number]
+        bent = [one for i, one in enumerate(self.bent) if i != number]
+        costs, apart = [], []
+        for mine in ([], [self.changes[number][:, None]]):
+            columns = [self.base, *others, *mine]
+            solution, design = self._solved(columns, bent, form, target)
+            costs.append(float(target @ target - target @ design @ solution))
+            apart.append(self._left_out(design, self._prior(columns, bent, form), target, groups))
+        return max(costs[0] - costs[1], 0.0), apart[0] - apart[1]
+
+    def _prior(self, plain: Sequence[np.ndarray], bent: Sequence[np.ndarray], form: float) -> np.ndarray:
+        """(F, F) precision of the columns."""
+        sizes = [sum(one.shape[1] for one in each) for each in (plain, bent)]
+        prior = np.diag(np.repeat([0.0, form**-2], sizes))
+        prior[: len(self.precision), : len(self.precision)] = self.precision
+        return prior
+
+    def _solved(self, plain: Sequence[np.ndarray], bent: Sequence[np.ndarray], form: float, target: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (F,) of least cost, and the columns (n, F)."""
+        design = np.concatenate([*plain, *bent], axis=1)
+        return _solve(design.T @ design + self._prior(plain, bent, form), design.T @ target), design
+
+    def _left_out(self, design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: Sequence[Sequence[int]]
+                  ) -> np.ndarray:
+        """(G,) squared residual of each manoeuvre, with coefficients fitted to the others."""
+        matrix, right, out = design.T @ design + prior, design.T @ target, []
+        columns, aim = design.reshape(self.shape[0], -1, design.shape[1]), target.reshape(self.shape[0], -1)
+        for group in groups:
+            x, y = columns[list(group)].reshape(-1, design.shape[1]), aim[list(group)].reshape(-1)
+            out.append(float(np.square(y - x @ _solve(matrix - x.T @ x, right - x.T @ y)).sum()))
+        return np.array(out)
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution of equations that may be dependent."""
+    return np.linalg.solve(matrix + RIDGE * max(float(np.trace(matrix)), 1e-9) * np.eye(len(matrix)), right)
 
 
 def forms_of(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:

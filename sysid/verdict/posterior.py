@@ -71,12 +71,14 @@ class TriedSet:
     gain: float
     """By how much they lower the cost of the base fit."""
     p: tuple[float, ...]
-    """Of each effect beside the others, family-wise."""
+    """Of each effect beside other forms of the others, family-wise; what these forms leave counts as noise."""
     p_value: float
     """Of "nothing is missing", where this set is taken for what is missing."""
     left: Left
     own: tuple[float, ...]
     """By how much each effect lowers the cost beside other forms of the others."""
+    foretold: tuple[float, ...]
+    """Lower 95 % end of what each effect so gains on manoeuvres, with all sizes fitted to the other manoeuvres."""
     bent: Left
     """What is left where all may have other forms."""
     classes: tuple[tuple[str, ...], ...]
@@ -109,8 +111,6 @@ class Findings:
     """Degrees of freedom that it rests on."""
     usual: float
     """What smooth functions gain on a reference day, per trial."""
-    usual_size: float
-    """Root mean square of it over the days, for a new one; 0 where reference days do not show it."""
     sets: tuple[TriedSet, ...] = ()
     against: dict[str, list[str]] = field(default_factory=dict)
     """Names of a set, joined by "+" -> what contradicts them. A set that is not there was not put to the test."""
@@ -123,23 +123,15 @@ class Findings:
 
         return float(stats.t.sf(excess / self.day, self.freedom))
 
-    def smooth_limit(self, alpha: float) -> float:
-        """What smooth functions gain per trial on a day with nothing in it with probability alpha."""
-        from scipy import stats
-
-        return float(stats.t.isf(alpha, self.freedom)) * self.usual_size if self.usual_size > 0 else float("inf")
-
     def something(self, priors: Thresholds) -> bool:
         """Whether any look at the drives shows more than noise: the scan, what is left, or the scan of pairs."""
         looks = [self.p_scan, self.p_excess(self.excess), *([] if self.p_pairs is None else [self.p_pairs])]
         return min(looks) < priors.alpha
 
     def settled(self, priors: Thresholds) -> bool:
-        """Whether a single effect explains enough and leaves nothing to look for."""
+        """Whether what was found explains enough."""
         chosen = choose(self, priors)
-        one = None if chosen is None else self.sets[chosen]
-        return (one is not None and len(one.effects) == 1 and self.calm(one, priors)
-                and self.named(one, priors) >= priors.share)
+        return chosen is not None and self.named(self.sets[chosen], priors) >= priors.share
 
     def put_to_test(self, effects: Sequence[str], against: Sequence[str]) -> Findings:
         """With what contradicts a set of effects."""
@@ -168,15 +160,16 @@ class Findings:
         return self.share(one.gain, one.left, priors.form**2, priors.alpha)
 
     def own(self, one: TriedSet, priors: Thresholds) -> bool:
-        """Whether every effect of a set is significant, and does more than to mend the form of the others."""
-        return max(one.p) < priors.alpha and all(
-            len(one.effects) == 1 or self.share(gain, one.bent, 1.0, priors.alpha) >= priors.share for gain in one.own)
+        """Whether every effect of a set does more than to mend the form of the others: it is significant beside these,
+        and the others' manoeuvres foretell it."""
+        return max(one.p) < priors.alpha and (len(one.effects) == 1 or min(one.foretold) > 0)
 
-    def calm(self, one: TriedSet, priors: Thresholds) -> bool:
-        """Whether other forms of a set leave no more than days differ by, or nothing that smooth functions predict
-        better than on usual days."""
-        return (self.p_excess(one.bent.excess) >= priors.alpha
-                or one.bent.smooth <= self.smooth_limit(priors.alpha) * self.trials < float("inf"))
+    def log_weight(self, gain: float, effects: int, priors: Thresholds) -> float:
+        """Of an explanation: what it gains, in units of what days differ by, less log(1 / alpha) for each effect.
+
+        Squared residuals of days with nothing missing vary by `day`, as those of 2 / day^2 independent values do.
+        """
+        return gain / max(self.day**2 * self.count, 2.0) - effects * float(np.log(1 / priors.alpha))
 
 
 @dataclass(frozen=True)
@@ -201,19 +194,13 @@ def posterior(findings: Findings, priors: Thresholds) -> Posterior:
 
 
 def choose(findings: Findings, priors: Thresholds) -> int | None:
-    """The number of the set that explains most, if there is any.
+    """The number of the set of the largest posterior weight, if there is any.
 
-    Every effect of it must be significant and more than another form of the others. A further effect is looked for only
-    where other forms of one leave more than days differ by.
+    Every effect of it must be significant and more than another form of the others.
     """
-    sets = findings.sets
-    able = [i for i, one in enumerate(sets) if findings.own(one, priors)]
-    first = max((i for i in able if len(sets[i].effects) == 1), key=lambda i: sets[i].gain, default=None)
-    if first is not None and findings.calm(sets[first], priors):
-        if findings.named(sets[first], priors) >= priors.share:
-            return first
-        able = [i for i in able if i == first or not set(sets[first].effects) & set(sets[i].effects)]
-    return max(able, key=lambda i: sets[i].gain, default=None)
+    able = [i for i, one in enumerate(findings.sets) if findings.own(one, priors)]
+    return max(able, key=lambda i: findings.log_weight(findings.sets[i].gain, len(findings.sets[i].effects), priors),
+               default=None)
 
 
 def _decide(findings: Findings, priors: Thresholds) -> tuple[str, int | None, float, str]:
@@ -261,18 +248,16 @@ def _weights(findings: Findings, priors: Thresholds, chosen: int | None) -> dict
     out = {nothing: float(weight)}
     if not findings.sets:
         return out
-    unit = 2 * max(findings.day**2 * findings.count / 2, 1.0)
-    price = np.log(1 / priors.alpha)
     able = {i for i, one in enumerate(findings.sets) if findings.own(one, priors)}
     names, logs = [], []
     for i, one in enumerate(findings.sets):
         if (i in able or i == chosen) and not findings.against.get("+".join(one.effects)):
             names.append(" + ".join(one.effects))
-            logs.append(one.gain / unit - price * len(one.effects))
+            logs.append(findings.log_weight(one.gain, len(one.effects), priors))
     most = max((one.gain + max(0.0, *findings.predictable(one.left, priors.form**2, priors.alpha).values())
                 for one in findings.sets), default=findings.excess * findings.count)
     names.append("unknown")
-    logs.append(priors.share * most / unit - price)
+    logs.append(findings.log_weight(priors.share * most, 1, priors))
     rest = np.exp(np.array(logs) - max(logs))
     for name, part in zip(names, (1 - weight) * rest / rest.sum(), strict=True):
         out[name] = max(out.get(name, 0.0), float(part))
@@ -291,7 +276,7 @@ def from_json(content: dict[str, Any]) -> Findings:
 
     sets = tuple(
         TriedSet(tuple(one["effects"]), tuple(one["variants"]), tuple(one["coordinates"]), one["gain"], tuple(one["p"]),
-                 one["p_value"], left(one["left"]), tuple(one["own"]), left(one["bent"]),
+                 one["p_value"], left(one["left"]), tuple(one["own"]), tuple(one["foretold"]), left(one["bent"]),
                  tuple(tuple(each) for each in one["classes"])) for one in content["sets"])
     known = {key: value for key, value in content.items() if key not in ("schema", "sets", "noise")}
     return Findings(**known, sets=sets, noise=tuple(content["noise"]))

@@ -221,17 +221,21 @@ def _widest(
 
 
 def candidate_of(asked: Asked, h: int, fit: Refit, current: Refit) -> Candidate:
-    """A refitted hypothesis with the p-value of its gain, less what such an effect gains on a day without it."""
-    one, evidence = asked.hypotheses[h], asked.evidence
+    """A refitted hypothesis with the p-value of its gain."""
     gain = max(current.cost - fit.cost, 0.0)
-    q = fit.q[-len(one.axes) :]
+    return Candidate(asked.hypotheses[h], gain, p_of_last(asked, fit, gain), asked.explained(fit), fit)
+
+
+def p_of_last(asked: Asked, fit: Refit, gain: float) -> float:
+    """Family-wise p-value of a gain by the last effect of a joint fit, less what it gains on a day without it."""
+    one, evidence = fit.hypotheses[-1], asked.evidence
+    h, q = asked.hypotheses.index(one), fit.q[-len(one.axes) :]
     inside = beside(fit.products(evidence.precision), len(q))
     moved = np.abs(q) > 1e-9
     inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, asked.wander.at(evidence.columns, h, q)))
     alone = float(q[moved] @ inside @ q[moved])
     whole = float(q[moved] @ np.linalg.pinv(np.linalg.pinv(inside) + wide) @ q[moved])
-    worth = gain * min(whole / alone, 1.0) if alone > 0 else 0.0
-    return Candidate(one, gain, asked.scan.p_of(h, worth), asked.explained(fit), fit)
+    return asked.scan.p_of(h, gain * min(whole / alone, 1.0) if alone > 0 else 0.0)
 
 
 def pair_round(asked: Asked, pairs: PairScan, tried: set[str]) -> list[tuple[list[Candidate], float]]:

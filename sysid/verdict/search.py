@@ -7,12 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.missing.joint_fit import Start
+from sysid.missing.evidence import Solver, at_fit
+from sysid.missing.joint_fit import Start, moved_last
+from sysid.verdict.agreement import interval_of_sum
 from sysid.verdict.forms import forms_of
 from sysid.verdict.found import EFFORT, LARGEST, Candidate, PairScan, Search
 from sysid.verdict.pairs import scan_pairs
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
-from sysid.verdict.rounds import POLISH, Asked, candidates_of, class_of, pair_round
+from sysid.verdict.rounds import POLISH, Asked, candidates_of, class_of, p_of_last, pair_round
+from sysid.verdict.scan import best
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ def settle(asked: Asked, pairs: PairScan | None) -> Search:
     excess = asked.excess(base.residual)
     found = Search("none", base, base, asked.scan, excess=(excess, excess), pairs=pairs, reason=NOTHING)
     findings = Findings(excess, asked.scan.p_family, None if pairs is None else pairs.p_family, asked.scan.p_family,
-                        asked.count, len(base.residual), wander.excess, wander.freedom, wander.usual, wander.usual_size)
+                        asked.count, len(base.residual), wander.excess, wander.freedom, wander.usual)
     weighed: list[Weighed] = []
     if findings.something(asked.thresholds):
         weighed = _one_by_one(asked, found, findings)
@@ -71,10 +74,24 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
         able = [one for one in new if findings.own(one.numbers, asked.thresholds)]
         if len(members) == 2:
             out += [each for one in new for each in _without_stand_ins(asked, one)]
-        if not able or asked.p_left(able[0].members[-1].refit.residual) >= asked.thresholds.alpha:
+        if not able or not more_stands_out(asked, able[0]):
             break
         members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
     return out
+
+
+def more_stands_out(asked: Asked, one: Weighed) -> bool:
+    """Whether any further effect stands out beside a set of effects whose forms may be others, by a linear scan. What
+    these forms leave counts as noise."""
+    fit, forms = one.members[-1].refit, forms_of(asked.refitter, one.members[-1].refit, asked.evidence.groups)
+    bent = np.concatenate(forms.bent, axis=1).reshape(*fit.residual.shape, -1)
+    held = np.repeat([0.0, asked.thresholds.form**-2], [len(fit.q), bent.shape[-1]])
+    around = at_fit(asked.evidence, fit.residual, np.concatenate([fit.jacobian, bent], axis=-1),
+                    fit.u - asked.refitter.reference.u, held)
+    _, worth, _ = best(Solver(around), asked.hypotheses, asked.wander)
+    noise = 1 + max(one.numbers.bent.excess, 0.0)
+    return any(asked.scan.p_of(h, float(worth[h]) / noise) < asked.thresholds.alpha
+               for h, each in enumerate(asked.hypotheses) if each.effect not in one.numbers.effects)
 
 
 def _without_stand_ins(asked: Asked, one: Weighed) -> list[Weighed]:
@@ -97,13 +114,17 @@ def _weighed(asked: Asked, members: Sequence[Candidate], rivals: Sequence[Sequen
     """The numbers of a set of effects."""
     fit = members[-1].refit
     forms = forms_of(asked.refitter, fit, asked.evidence.groups)
-    form = asked.thresholds.form
+    form, count = asked.thresholds.form, range(len(members))
+    bent = _left(asked, forms.left(form))
+    own = [forms.gain(form, i, asked.evidence.groups) for i in count]
+    noise = 1 + max(bent.excess, 0.0)
+    p = [p_of_last(asked, moved_last(fit, i), gain / noise) for i, (gain, _) in enumerate(own)]
     numbers = TriedSet(
         tuple(one.effect for one in fit.hypotheses), tuple(one.key for one in fit.hypotheses), tuple(fit.q.tolist()),
-        asked.base.cost - fit.cost, tuple(one.p for one in members),
+        asked.base.cost - fit.cost, tuple(p) if len(p) > 1 else (members[0].p,),
         together if together is not None else max(asked.scan.p_family, min(one.p for one in rivals[0])),
-        _left(asked, fit.residual), tuple(forms.gain(form, i) for i in range(len(members))),
-        _left(asked, forms.left(form)[1]),
+        _left(asked, fit.residual), tuple(gain for gain, _ in own), tuple(interval_of_sum(each)[0] for _, each in own),
+        bent,
         tuple(tuple(class_of(asked, one, each)) for one, each in zip(members, rivals, strict=True)))
     return Weighed(numbers, tuple(members), tuple(rivals), together)
 

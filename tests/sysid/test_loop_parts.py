@@ -104,19 +104,19 @@ def test_an_effect_is_held_against_what_it_leaves_though_it_could_be_predicted(s
     asked = Asked(None, (one,), SimpleNamespace(drives=drives), Wander((), (), freedom=10.0), Thresholds(),
                   SimpleNamespace(cost=float(residual.size)), None, None, lambda _: smooth * residual.size)
     left = search_module._left(asked, residual)
-    findings = Findings(0.0, 0.0, None, 0.0, residual.size, trials, asked.wander.excess, 10.0, 0.0, 0.0)
+    findings = Findings(0.0, 0.0, None, 0.0, residual.size, trials, asked.wander.excess, 10.0, 0.0)
     assert findings.share(residual.size, left, 0.25, Thresholds().alpha) == pytest.approx(share, abs=0.03)
 
 
 def tried(excess, p=1e-6, effects=("quadratic_drag",), gain=1.0, bent=0.0, own=None, smooth=0.0):
     left, size = Left(excess, excess, smooth), len(effects)
     return TriedSet(effects, effects, (1.0,) * size, gain, (p,) * size, p, left, own or (gain,) * size,
-                    Left(bent, bent, 0.0), tuple((name,) for name in effects))
+                    own or (gain,) * size, Left(bent, bent, 0.0), tuple((name,) for name in effects))
 
 
 def findings(excess, sets, p=0.0):
     """Of drives of which days with nothing missing differ by 1."""
-    return Findings(excess, 0.0, None, p, 1.0, 1, 1.0, 10.0, 0.0, 0.0, tuple(sets))
+    return Findings(excess, 0.0, None, p, 1.0, 1, 1.0, 10.0, 0.0, tuple(sets))
 
 
 @pytest.mark.quick
@@ -165,19 +165,19 @@ def test_a_simulated_day_is_an_alarm_where_the_verdict_would_be_that_something_i
 
 @pytest.mark.quick
 def test_a_further_effect_must_do_more_than_to_mend_the_form_of_the_others():
-    first, both = tried(8.0, gain=20.0, bent=8.0), ("quadratic_drag", "slope")
-    for own, names in (((20.0, 9.0), 2), ((20.0, 0.1), 1)):
-        given = findings(28.0, [first, tried(0.0, effects=both, gain=28.0, own=own, bent=5.0)])
+    first, both = tried(8.0, gain=200.0, bent=8.0), ("quadratic_drag", "slope")
+    for own, names in (((200.0, 90.0), 2), ((200.0, -1.0), 1)):
+        given = findings(28.0, [first, tried(0.0, effects=both, gain=280.0, own=own, bent=5.0)])
         found = posterior(given, Thresholds())
         assert found.verdict == "named" and len(given.sets[found.chosen].effects) == names
         assert sum(found.weights.values()) == pytest.approx(1.0)
 
 
 @pytest.mark.quick
-def test_what_other_forms_of_one_effect_explain_calls_for_no_second_one():
-    given = findings(28.0, [tried(5.0, gain=23.0, bent=0.0),
-                            tried(0.0, effects=("quadratic_drag", "slope"), gain=28.0)])
-    assert posterior(given, Thresholds()).chosen == 0
+def test_a_further_effect_must_gain_more_than_days_differ_by():
+    for gain, chosen in ((28.0, 0), (38.0, 1)):
+        given = findings(28.0, [tried(5.0, gain=23.0), tried(0.0, effects=("quadratic_drag", "slope"), gain=gain)])
+        assert posterior(given, Thresholds()).chosen == chosen
 
 
 @pytest.mark.quick
