@@ -135,15 +135,15 @@ def shared(settings: Benchmark) -> None:
     config = LoopConfig()
     ready = prepare(reference_of(references, config), references[0].spec, config)
     path = RESULTS / "undeclared_shared.json"
-    content = json.loads(path.read_text()) if path.exists() else {"sets": {}}
-    content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(),
-                   **provenance())
     for name in settings.sets:
         began = time.perf_counter()
         log = load_log(settings.data / "undeclared" / name)
         result = replace(find_missing(log, (), config, reference=ready), references=tuple(references))
         report = make_report(result)
         write_run(settings.work / "shared" / name, result, report)
+        content = json.loads(path.read_text()) if path.exists() else {"sets": {}}  # other processes have other sets
+        content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(),
+                       **provenance())
         content["sets"][name] = {
             "verdict": report["verdict"], "reason": report["reason"],
             "effects": [{key: one[key] for key in ("name", "kind", "class", "parameters", "p_value")}

@@ -159,7 +159,7 @@ def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]
             if not may_be_alike(glances[group[0]], glances[i]):
                 continue
             shift = shift_between(courses[group[0]], courses[i])
-            if shift is not None and abs(shift) <= most:
+            if shift is not None and abs(shift) <= most + EXACT:
                 group.append(i)
                 break
         else:
