@@ -14,8 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from whill_mjx.io.fields import shown
+from whill_mjx.io.folders import write_whole
+from whill_mjx.io.formats import FORMATS, stamp, upgraded
+from whill_mjx.io.reading import read_json
+
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
-SCHEMA = 1
+KIND = "sysid-evidence"
+AGAIN = "Give evidence.json of a run of sysid.close_loop."
 
 
 @dataclass(frozen=True)
@@ -266,7 +272,7 @@ def _weights(findings: Findings, priors: Thresholds, chosen: int | None) -> dict
 
 def as_json(findings: Findings) -> dict[str, Any]:
     """The findings as a file has them."""
-    return {"schema": SCHEMA, **asdict(findings)}
+    return {**stamp(KIND), **asdict(findings)}
 
 
 def from_json(content: dict[str, Any]) -> Findings:
@@ -278,7 +284,7 @@ def from_json(content: dict[str, Any]) -> Findings:
         TriedSet(tuple(one["effects"]), tuple(one["variants"]), tuple(one["coordinates"]), one["gain"], tuple(one["p"]),
                  one["p_value"], left(one["left"]), tuple(one["own"]), tuple(one["foretold"]), left(one["bent"]),
                  tuple(tuple(each) for each in one["classes"])) for one in content["sets"])
-    known = {key: value for key, value in content.items() if key not in ("schema", "sets", "noise")}
+    known = {key: value for key, value in content.items() if key not in ("schema", "kind", "sets", "noise")}
     return Findings(**known, sets=sets, noise=tuple(content["noise"]))
 
 
@@ -288,19 +294,16 @@ def read(path: Path) -> Findings:
     Raises:
         ValueError: if it is none.
     """
-    from whill_mjx.io.reading import read_json
-
-    content = read_json(path, "no such file. Give evidence.json of a run of sysid.close_loop.",
-                        "Give evidence.json of a run of sysid.close_loop.")
+    content = upgraded(KIND, read_json(path, f"no such file. {AGAIN}", AGAIN))
+    if content.get("kind") != KIND or content.get("schema") != FORMATS[KIND].schema:
+        raise ValueError(f"{path}: kind {shown(content.get('kind'))}, schema {shown(content.get('schema'))}; this "
+                         f"program reads {KIND!r}, schema {FORMATS[KIND].schema}. {AGAIN}")
     try:
         return from_json(content)
     except (TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path}: no evidence of a verdict ({error}). Give evidence.json of a run of "
-                         "sysid.close_loop.") from None
+        raise ValueError(f"{path}: no evidence of a verdict ({error}). {AGAIN}") from None
 
 
 def write(path: Path, findings: Findings) -> None:
     """Keep the findings."""
-    from whill_mjx.io.folders import write_whole
-
     write_whole(path, json.dumps(as_json(findings), indent=1).encode() + b"\n")

@@ -15,7 +15,7 @@ from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
-from sysid.pages.loop_page import not_determined
+from sysid.pages.loop_page import not_determined, weights
 from sysid.pages.loop_report import in_range, unit_of
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
@@ -178,6 +178,21 @@ def test_a_further_effect_must_gain_more_than_days_differ_by():
     for gain, chosen in ((28.0, 0), (38.0, 1)):
         given = findings(28.0, [tried(5.0, gain=23.0), tried(0.0, effects=("quadratic_drag", "slope"), gain=gain)])
         assert posterior(given, Thresholds()).chosen == chosen
+
+
+@pytest.mark.quick
+def test_weights_are_bars_of_names_that_people_use():
+    drawn = weights({"weights": {"noise": 0.2, "quadratic_drag + slope": 0.5, "unknown": 0.3}})
+    assert all(text in drawn for text in ("only the noise", "quadratic drag and slope", "something unknown"))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("content", "wrong"), [("{}", "kind None"), ("[]", "a JSON object"), ("{", "not valid JSON")])
+def test_a_file_without_findings_is_refused_in_one_line(content, wrong, tmp_path):
+    (tmp_path / "evidence.json").write_text(content)
+    with pytest.raises(ValueError, match=wrong) as refused:
+        read(tmp_path / "evidence.json")
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.quick
