@@ -80,6 +80,9 @@ def find_missing(
         judge = partial(search_alone, wheels=any(trial.odometry is not None for trial in log.training))
     pairs = None if alone else pairs_of(asked, config.seed)
     outcome = judge(asked, pairs)
+    if outcome.findings is not None and noise is not None:
+        other = tuple(name for name, one in noise.report().items() if one["changed"])
+        outcome = outcome.judged(replace(outcome.findings, noise=other), config.thresholds)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
         nulls = run_null_refits(replace(asked, wander=usual.wander), judge, pairs, config.refit_nulls,
@@ -91,9 +94,6 @@ def find_missing(
         p_excess = (lambda _: 1.0) if alone else usual.wander.p_excess
         stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
-    if outcome.findings is not None and noise is not None:
-        other = tuple(name for name, one in noise.report().items() if one["changed"])
-        outcome = outcome.judged(replace(outcome.findings, noise=other), config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
     floor = floor_change(reference, log.training, config.thresholds.alpha)

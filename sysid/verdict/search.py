@@ -73,7 +73,7 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
         out += new
         able = [one for one in new if findings.own(one.numbers, asked.thresholds)]
         if len(members) == 2:
-            out += [each for one in new for each in _without_stand_ins(asked, one)]
+            out += [each for one in new[:1] for each in _without_stand_ins(asked, one)]
         if not able or not more_stands_out(asked, able[0]):
             break
         members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
