@@ -68,7 +68,8 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
     out: list[Weighed] = []
     for _ in range(EFFORT.rounds):
         candidates = candidates_of(asked, found, current)
-        likely = [one for one in candidates if one.p < asked.thresholds.alpha]
+        apart = {one.hypothesis.effect: one for one in reversed(candidates) if one.p < asked.thresholds.alpha}
+        likely = sorted(apart.values(), key=lambda one: -one.gain)  # of several forms of an effect the best one
         new = [_weighed(asked, (*members, one), (*rivals, candidates)) for one in likely[: EFFORT.weighed]]
         out += new
         able = [one for one in new if findings.own(one.numbers, asked.thresholds)]
