@@ -63,7 +63,7 @@ def _with(findings: Findings, found: Search, weighed: Sequence[Weighed]) -> Find
 
 
 def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed]:
-    """Effects one after the other, as long as more is left than days differ by."""
+    """Effects one after the other, as long as more is left than days differ by, or any stands out beside them."""
     current, members, rivals = asked.base, tuple[Candidate, ...](), tuple[Sequence[Candidate], ...]()
     out: list[Weighed] = []
     for _ in range(EFFORT.rounds):
@@ -75,7 +75,8 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
         able = [one for one in new if findings.own(one.numbers, asked.thresholds)]
         if len(members) == 2:
             out += [each for one in new[:1] for each in _without_stand_ins(asked, one)]
-        if not able or not more_stands_out(asked, able[0]):
+        if not able or (asked.p_left(able[0].members[-1].refit.residual) >= asked.thresholds.alpha
+                        and not more_stands_out(asked, able[0])):
             break
         members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
     return out
