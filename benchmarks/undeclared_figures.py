@@ -60,9 +60,10 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
     ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
     if ratios:
         found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
-    seconds = [one["seconds"] for _, one in cases if one["stage"] in ("scaled", "pair")]
-    if seconds:
-        found["seconds_per_log"] = figure(seconds, "s on one core, reference fit apart")
+    timed = [one for _, one in cases if one["stage"] in ("scaled", "pair") and "device" in one]
+    if timed:
+        found["seconds_per_log"] = figure([one["seconds"] for one in timed], "s on one core, reference fit apart",
+                                          timed[0]["device"])
     found.update(of_speed(work))
     found.update(of_decision([one["findings"] for _, one in [*cases, *noisy] if one.get("findings")]))
     found = {name + driven.tag: one for name, one in found.items()}

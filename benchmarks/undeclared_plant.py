@@ -275,7 +275,7 @@ def judge(
     config = replace(config, without=job.without)
     result = find_missing(load_log(folder), (), config, reference=ready)
     content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, "noise": job.noise, **brief(result),
-               "seconds": time.perf_counter() - began}
+               "seconds": time.perf_counter() - began, "device": device_name()}
     if full and result.search.verdict == "named":
         report = make_report(result)
         write_run(work / "reports" / job.label, result, report)
