@@ -256,7 +256,10 @@ def draw(path: Path) -> None:
         panel.set_xlabel("t [s]", fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}")
-    figure.savefig(temporary, dpi=100, format="png")
+    colours = {f"place: {where}": plt.Line2D([], [], color=colour) for where, colour in COLOURS.items()}
+    figure.suptitle("What each effect changes: the drive with it, less the drive without it", fontsize=11)
+    figure.legend(colours.values(), colours.keys(), loc="outside lower right", ncols=len(COLOURS), frameon=False)
+    figure.savefig(temporary, dpi=100, format="png", metadata={"Description": " ".join(sorted(names))})
     os.replace(temporary, path)
 
 
