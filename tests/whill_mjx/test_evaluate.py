@@ -16,6 +16,7 @@ import pytest
 from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
 from whill_mjx.evaluate import EvaluateOptions, choose_task, main
+from whill_mjx.evaluation import pages
 from whill_mjx.evaluation.conditions import nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures, summarise
@@ -328,3 +329,14 @@ def test_the_page_of_an_evaluation_has_words_and_the_style_of_all_reports(evalua
         assert words in text
     for key in ("min_clearance_m", "time_to_goal_s", "acceleration_rms_m_s2"):
         assert key not in text
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_the_legend_of_few_maps_is_not_wider_than_their_picture(columns):
+    plt = pages._pyplot()
+    figure, _ = plt.subplots(1, columns, figsize=(3.2 * columns, 2.2), layout="constrained")
+    pages._legend(figure, set(pages.ENDINGS), columns)
+    figure.canvas.draw()
+    place = figure.legends[0].get_window_extent()
+    plt.close(figure)
+    assert 0 <= place.x0 and place.x1 <= figure.bbox.width

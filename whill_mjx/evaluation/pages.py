@@ -61,7 +61,7 @@ def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: i
         axes.set_title(f"{ENDED[how]}, {episodes.ends['time_s'][index]:.1f} s", fontsize=8, color=ENDINGS[how])
         _scale_bar(axes)
     figure.get_layout_engine().set(h_pad=0.12)
-    _legend(figure, {ending(episodes, index) for index in range(count)})
+    _legend(figure, {ending(episodes, index) for index in range(count)}, min(3, columns))
     return _save(figure, out)
 
 
@@ -72,8 +72,8 @@ def _scale_bar(axes: Any, metres: float = 1.0) -> None:
     axes.text(x + metres / 2, y + 0.08, f"{metres:g} m", ha="center", va="bottom", fontsize=6)
 
 
-def _legend(figure: Any, endings: set[str]) -> None:
-    """Say below the maps what lines and marks mean."""
+def _legend(figure: Any, endings: set[str], columns: int) -> None:
+    """Say below the maps, in `columns` columns, what lines and marks mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -81,11 +81,11 @@ def _legend(figure: Any, endings: set[str]) -> None:
                           for how, colour in ENDINGS.items() if how in endings]  # fmt: skip
     handles += [
         Line2D([], [], color="grey", marker="o", linestyle="", markersize=4,
-               label="end of the drive axle's path (the body reaches farther)"),
+               label="end of the drive axle; the body is longer"),
         Line2D([], [], color="tab:blue", marker="s", linestyle=":", markersize=4, label="goal and its region"),
         Patch(color="grey", label="boxes and walls, in their colours"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=8)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8)
 
 
 def sweep_picture(sweep: Sweep, out: Path, name: str) -> Path:
