@@ -166,6 +166,13 @@ def test_pages_that_are_made_are_up_to_date():
             f"A new task also needs its picture (... picture --tasks {name}) and a line in mkdocs.yml and index.md.")
 
 
+def test_each_command_says_what_it_does_by_a_verb():
+    from benchmarks import command_page
+
+    said = re.findall(r"^\| \[`python -m .*\| (\w+) ", command_page.page(), re.MULTILINE)
+    assert len(said) > 20 and not [word for word in said if word in ("A", "An", "The") or word.endswith("s")]
+
+
 def test_links_of_the_repository_become_links_of_the_site():
     spec = importlib.util.spec_from_file_location("site_hooks", ROOT / "docs" / "site_hooks.py")
     hooks = importlib.util.module_from_spec(spec)

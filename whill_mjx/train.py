@@ -1,4 +1,4 @@
-"""The main job: fit the vehicle to a driving log, train a policy in its simulator, evaluate it and export it.
+"""Fit the vehicle to a driving log, train a policy in its simulator, evaluate it and export it.
 
     python -m whill_mjx.train --out RUN [--vehicle FIT/vehicle.toml] [--task obstacle_course] [--preset auto]
 
