@@ -231,7 +231,7 @@ def _figures(drivers: dict[str, Any]) -> str:
         for figures in drivers.values():
             row += [_shown(name, figures[name]), html.Cell(_interval(name, figures[f"{name}_interval_95"]), "i")]
         rows.append(row)
-    header = ["figure", *(text for name in drivers for text in (_driver(name), "95 % interval"))]
+    header = ["figure", *(text for name in drivers for text in (_driver(name), "95% interval"))]
     return html.table(header, rows)
 
 
