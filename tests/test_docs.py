@@ -193,3 +193,10 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     text = (tmp_path / "site" / "api" / "whill_mjx.html").read_text()
     assert "make_batch" in text and "Args" not in (tmp_path / "site" / "index.html").read_text()
+
+
+def test_the_first_hour_is_timed_with_the_commands_of_readme():
+    from benchmarks.first_hour import PARTS
+
+    readme = re.sub(r" *#.*", "", (ROOT / "README.md").read_text())
+    assert all(line in readme.splitlines() for lines in PARTS.values() for line in lines)
