@@ -41,6 +41,13 @@ def test_no_sentence_is_longer_than_35_words(page):
     assert not long, f"{page.name}: {len(long)} sentences of more than {MOST_WORDS} words. Split them: {long[0]!r}"
 
 
+@pytest.mark.parametrize("page", DOCS, ids=str)
+def test_a_page_begins_with_a_sentence_and_not_with_code(page):
+    """Or with a table, which a glossary is."""
+    _, *blocks = [block for block in page.read_text().split("\n\n") if not block.startswith("<!--")]
+    assert not blocks[0].startswith(("```", "![")), f"{page.name}: say first what the page is for."
+
+
 @pytest.mark.parametrize("page", PAGES, ids=str)
 def test_links_between_pages_lead_somewhere(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
