@@ -60,7 +60,7 @@ class Figures:
     def fill(self, text: str, stem: str, release: str | None = None) -> str | None:
         """`text` with its cells filled in; None where it has cells and none of them was measured.
 
-        With `release`, * marks what another release measured: the end of a text of which all is older, else each figure.
+        With `release`, * marks figures of other releases: the end of a text of which all are, else each of them.
         """
         cells = list(CELL.finditer(text))
         entries = [self.entry(cell["stem"] or stem, cell["name"]) for cell in cells]

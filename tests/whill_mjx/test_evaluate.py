@@ -135,6 +135,36 @@ def test_network_operators_agree_with_onnxruntime_on_a_graph_of_many():
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
+ONE_OPERATOR = (  # with its attributes, and the constants after the first input (3, 4)
+    ("Atan", {}, ()), ("Ceil", {}, ()), ("Round", {}, ()), ("Tan", {}, ()), ("Erf", {}, ()), ("Dropout", {}, ()),
+    ("Elu", {"alpha": 0.7}, ()), ("LeakyRelu", {"alpha": 0.2}, ()), ("LogSoftmax", {"axis": 0}, ()),
+    ("Flatten", {"axis": 0}, ()),
+    ("CastLike", {}, (np.zeros(1, np.float32),)), ("Tile", {}, (np.array([2, 1]),)),
+    ("Mod", {"fmod": 1}, (np.array([0.7], np.float32),)), ("ReduceProd", {"keepdims": 0}, (np.array([1]),)),
+    ("LayerNormalization", {"epsilon": 1e-3}, (np.arange(4, dtype=np.float32), np.ones(4, np.float32))),
+    ("BatchNormalization", {}, tuple(np.arange(1, 5, dtype=np.float32) * k for k in (1, 2, 3, 4))),
+)  # fmt: skip
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("kind", "attributes", "constants"), ONE_OPERATOR, ids=[one[0] for one in ONE_OPERATOR])
+def test_an_operator_of_other_libraries_agrees_with_onnxruntime(kind, attributes, constants):
+    import onnxruntime
+    from onnx import TensorProto, helper, numpy_helper
+
+    named = [numpy_helper.from_array(value, f"c{k}") for k, value in enumerate(constants)]
+    graph = helper.make_graph(
+        [helper.make_node(kind, ["x", *(one.name for one in named)], ["y"], **attributes)], kind,
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, [3, 4])],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)], named,
+    )  # fmt: skip
+    data = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8).SerializeToString()
+    x = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)
+    [theirs] = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"]).run(None, {"x": x})
+    np.testing.assert_allclose(Network(data)(x)[0], theirs, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(Network(data))(x)[0], theirs, atol=1e-5)
+
+
 @pytest.mark.quick
 def test_damaged_and_foreign_policy_files_are_refused(seeker, tmp_path):
     import shutil
