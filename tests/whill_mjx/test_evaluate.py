@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import os
+import re
 
 import jax
 import jax.numpy as jnp
@@ -354,7 +355,7 @@ def test_a_video_that_cannot_be_written_says_what_ffmpeg_said(tmp_path):
 def test_the_page_of_an_evaluation_has_words_and_the_style_of_all_reports(evaluated):
     out, _ = evaluated
     text = (out / "report.html").read_text()
-    assert STYLE in text
+    assert STYLE in text and re.search(r'class="lead">[^<]* succeeds in [^<]*%[^<]* Without sight it succeeds in', text)
     for words in ("smallest clearance [m]", "time to the goal [s]", "the policy: it sees only its first image"):
         assert words in text
     for key in ("min_clearance_m", "time_to_goal_s", "acceleration_rms_m_s2"):

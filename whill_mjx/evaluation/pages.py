@@ -218,6 +218,8 @@ def page(evaluation: dict[str, Any], pictures: list[Path], videos: list[Path], o
     subtitle = f"{first['episodes']} episodes with each driver; computed on {device}"
     main_name = next(iter(drivers))
     lead = f"{_driver(main_name).capitalize()} succeeds in {_shown('success', first['success'])} of the episodes."
+    blind = [one["success"] for name, one in drivers.items() if name.startswith(f"{main_name} ")]
+    lead += f" Without sight it succeeds in at most {_shown('success', max(blind))}." if blind else ""
     title = f"Evaluation of {evaluation['policy']} in the task {task}"
     write_whole(out, html.html_page(title, sections, subtitle, kind="Evaluation", lead=lead))
     return out
@@ -258,7 +260,7 @@ def _caption(path: Path) -> str:
 def _shown(name: str, value: float | None) -> str:
     if value is None:
         return "–"
-    return f"{100 * value:.1f} %" if name in SHARES else html.number(float(value))
+    return f"{value:.1%}" if name in SHARES else html.number(float(value))
 
 
 def _interval(name: str, interval: list[float] | None) -> str:
