@@ -356,7 +356,7 @@ def test_the_page_of_an_evaluation_has_words_and_the_style_of_all_reports(evalua
     out, _ = evaluated
     text = (out / "report.html").read_text()
     assert STYLE in text and re.search(r'class="lead">[^<]* succeeds in [^<]*%[^<]* Without sight it succeeds in', text)
-    for words in ("smallest clearance [m]", "time to the goal [s]", "the policy: it sees only its first image"):
+    for words in ("smallest clearance [m]", "time to the goal [s]", "the policy with its first image alone"):
         assert words in text
     for key in ("min_clearance_m", "time_to_goal_s", "acceleration_rms_m_s2"):
         assert key not in text

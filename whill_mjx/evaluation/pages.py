@@ -193,8 +193,8 @@ WORDS = {
 """Words for the figures of a summary."""
 DRIVERS = {
     "policy": "the policy", "planner": "planner that knows the scene", "random": "random actions",
-    "blank": "it sees black images", "freeze": "it sees only its first image",
-    "replay": "it drives actions of another episode",
+    "blank": "with black images", "freeze": "with its first image alone",
+    "replay": "with another episode's actions",
 }  # fmt: skip
 """Words for drivers and for proofs of sight."""
 CAPTIONS = {
@@ -229,12 +229,9 @@ def _figures(drivers: dict[str, Any]) -> str:
     first = next(iter(drivers.values()))
     rows: list[list[Any]] = []
     for name in (name for name in WORDS if f"{name}_interval_95" in first):
-        row: list[Any] = [WORDS[name]]
-        for figures in drivers.values():
-            row += [_shown(name, figures[name]), html.Cell(_interval(name, figures[f"{name}_interval_95"]), "i")]
-        rows.append(row)
-    header = ["figure", *(text for name in drivers for text in (_driver(name), "95% interval"))]
-    return html.table(header, rows)
+        cells = [_with_interval(name, one[name], one[f"{name}_interval_95"]) for one in drivers.values()]
+        rows.append([WORDS[name], *cells])
+    return html.table(["figure", *map(_driver, drivers)], rows, "in brackets: the 95% interval")
 
 
 def _meanings(first: dict[str, Any]) -> str:
@@ -247,7 +244,7 @@ def _driver(name: str) -> str:
     """A driver in words: "policy freeze" is the policy without sight."""
     base, _, blind = name.partition(" ")
     text = DRIVERS.get(base, base)
-    return f"{text}: {DRIVERS[blind]}" if blind in DRIVERS else text
+    return f"{text} {DRIVERS[blind]}" if blind in DRIVERS else text
 
 
 def _caption(path: Path) -> str:
@@ -263,5 +260,6 @@ def _shown(name: str, value: float | None) -> str:
     return f"{value:.1%}" if name in SHARES else html.number(float(value))
 
 
-def _interval(name: str, interval: list[float] | None) -> str:
-    return "–" if interval is None else f"{_shown(name, interval[0])} to {_shown(name, interval[1])}"
+def _with_interval(name: str, value: float | None, interval: list[float] | None) -> str:
+    between = "" if interval is None else f" ({_shown(name, interval[0])} to {_shown(name, interval[1])})"
+    return _shown(name, value) + between
