@@ -87,7 +87,7 @@ def shown(entry: dict[str, Any], form: str) -> str:
     if "range" in words:
         low, high = (number(end(entry["repeats"]) * factor) + unit for end in (min, max))
         return low if low == high else f"{low} to {high}"
-    value = entry["value"] if key is None else entry[key]
+    value = entry["value"] if key is None else entry.get(key)  # files of earlier runs lack newer fields
     return number(value if value is None else value * factor) + unit
 
 
