@@ -1,4 +1,4 @@
-"""Velocity commands for a WHILL Model CR whose driver takes only its virtual joystick.
+"""Send velocity commands to a WHILL Model CR whose driver takes only its virtual joystick.
 
     python -m bridge.chair_joy --full 0.567 0.557 0.8
 

@@ -1,4 +1,4 @@
-"""The policy node: camera image in, wheel command out.
+"""Run the policy node: camera image in, wheel command out.
 
     python -m bridge.drive runs/corridor/policy
 

@@ -1,4 +1,4 @@
-"""Drives a command file on the vehicle and records it: the manoeuvres of sysid.design, sysid.close_loop or your own.
+"""Drive a command file on the vehicle and record it: the manoeuvres of sysid.design, sysid.close_loop or your own.
 
     python -m bridge.manoeuvre command.csv --space 6 4 --dataset logs/monday --trial circle --repeat 3
 

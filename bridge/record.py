@@ -1,4 +1,4 @@
-"""Records one drive as a trial of a driving-log dataset, which `sysid.fit` reads.
+"""Record one drive as a trial of a driving-log dataset, which `sysid.fit` reads.
 
     python -m bridge.record logs/monday figure_eight_1
     python -m bridge.record logs/monday afternoon --split 3      # afternoon_1, afternoon_2, ...: one for each drive

@@ -1,4 +1,4 @@
-"""The simulator behind the vehicle's topics, so that the policy node sees no difference from the chair.
+"""Run the simulator behind the vehicle's topics; the policy node sees no difference from the chair.
 
     python -m bridge.simulate RUN/policy --episodes 10
 

@@ -81,11 +81,17 @@ def test_readme_has_at_most_ten_figures_and_both_pages_agree_with_the_result_fil
 
 
 def test_a_figure_of_another_release_is_marked_as_older(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "HEADLINES", (("camera", "a run", "{dt_s} s"),))
-    path = record("camera", "it runs", {"dt_s": figure([1.0], "s", "x")}, tmp_path)
-    assert "| a run | 1 s | x |" in headlines(tmp_path)
+    lines = ("camera", "a run", "{dt_s} s"), ("camera", "a race", "{dt_s} s (others: {peer_s} s)")
+    monkeypatch.setattr(tables, "HEADLINES", lines)
+    figures = {name: figure([1.0], "s", "x") for name in ("dt_s", "peer_s")}
+    path = record("camera", "it runs", figures, tmp_path)
+    assert "| a run | 1 s | x |" in headlines(tmp_path) and "*" not in headlines(tmp_path)
+    content = json.loads(path.read_text())
+    content["figures"]["peer_s"]["release"] = "0.0.1"
+    path.write_text(json.dumps(content))
+    assert "| a run | 1 s | x |\n| a race | 1 s (others: 1* s) | x |\n\nFigures with *" in headlines(tmp_path)
     path.write_text(path.read_text().replace(f'"release": "{__version__}"', '"release": "0.0.1"'))
-    assert "| a run | 1 s* | x |" in headlines(tmp_path)
+    assert "| a run | 1 s* | x |\n| a race | 1 s (others: 1 s)* | x |\n\nFigures with *" in headlines(tmp_path)
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--check"]])

@@ -279,7 +279,7 @@ def residuals(series: Sequence[TrialSeries], drawn: Sequence[TrialSeries]) -> st
         parts += [legend([(_label(trial), PALETTE[k % len(PALETTE)]) for k, trial in enumerate(mine)]), charts(items),
                   heading(f"{CHANNEL_NAMES[channel].capitalize()}: autocorrelation of the residual about zero"),
                   legend([("training trials", PALETTE[0]), ("held-out trials", PALETTE[1])]),
-                  charts(_autocorrelations(series, channel), "White noise would lie in the band for 95 % of the lags.")]
+                  charts(_autocorrelations(series, channel), "White noise would lie in the band for 95% of the lags.")]
     return "".join(parts)
 
 
@@ -382,7 +382,7 @@ def search(report: dict[str, Any]) -> str:
     costs = [cost for cost in about.get("start_costs") or [] if cost is not None]
     if costs:
         near = sum(1 for cost in costs if cost < 1.02 * min(costs))
-        rows.append(["starts within 2 % of the best", f"{near} of {len(costs)}"])
+        rows.append(["starts within 2% of the best", f"{near} of {len(costs)}"])
     items = [line_chart([Line(np.array(one["values"], float), np.array(one["cost"], float), markers=True)],
                         f"{one['name']} [s]", "cost", "delay profile", width=320, height=220)
              for one in about.get("delay_profiles") or []]

@@ -87,7 +87,7 @@ def effects(report: dict[str, Any]) -> str:
             was = p.get("was")
             rows.append([spoken(one["name"]), p.get("description") or name, p["value"], *p["interval"], p["unit"],
                          was if was is not None and np.isfinite(was) else "none", name])
-    parts = [table(["effect", "what it is", "value", "95 % from", "to", "unit", "before", "name in vehicle.toml"],
+    parts = [table(["effect", "what it is", "value", "95% from", "to", "unit", "before", "name in vehicle.toml"],
                    rows)]
     if left_open := [text for one in report["effects"] for text in not_determined(one["parameters"])]:
         parts.append(bullets(left_open))
@@ -128,7 +128,7 @@ def agreement(effect: dict[str, Any]) -> str:
             "untold": "are too few, or see too little of it, to differ on its size"}[test["outcome"]]
     return (f"{test['manoeuvres']} manoeuvres excite {effect['name']}. They {said} (p = {test['p_value']:.2g}, power "
             f"{test['power']:.0%}). Left out, manoeuvres gain {evidence['left_out_total']:.0f} of squared residual "
-            f"together (95 % interval {low:.0f} to {high:.0f}).")
+            f"together (95% interval {low:.0f} to {high:.0f}).")
 
 
 def predictions(effect: dict[str, Any]) -> str:
@@ -202,7 +202,7 @@ def by_manoeuvre(report: dict[str, Any]) -> str:
                              f"[{unit}]", factor * row["before"], factor * row["after"],
                              *(factor * end for end in row["interval"]), row["trials"]])
         if rows:
-            parts.append(table(["manoeuvre", "usual error", "as it was", "after", "change, 95 % from", "to", "drives"],
+            parts.append(table(["manoeuvre", "usual error", "as it was", "after", "change, 95% from", "to", "drives"],
                                rows, words))
     return "".join(parts)
 
