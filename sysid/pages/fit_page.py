@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.coverage import CHECK
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
@@ -85,11 +86,13 @@ def lead(report: dict[str, Any]) -> list[str]:
     """Three sentences: how good the fit is, what it changed, and what it does not know."""
     known = [one for one in report["parameters"] if one["identifiable"]]
     unknown = [one["name"] for one in report["parameters"] if not one["identifiable"]]
-    moved = sorted(known, key=_change, reverse=True)[:2]
+    inside = [one for one in known if not one["remark"] and _change(one) > 1]  # not at the end of its range
+    moved = sorted(inside, key=_change, reverse=True)[:2]
     changed = "; ".join(f"{_spoken(one['name'])} from {number(one['initial'])} to {number(one['value'])}"
                         + ("" if one["unit"] == "-" else f" {one['unit']}") for one in moved)
-    second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; most surely changed: "
-              f"{changed}." if known else "This log determines none of the parameters.")
+    second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; "
+              f"{f'most surely changed: {changed}' if moved else 'none is surely other than it was'}."
+              if known else "This log determines none of the parameters.")
     if not report["summary"]["held_out"]:
         third = "Nothing was held out, so how well the vehicle predicts other drives is not known."
     elif unknown:
@@ -114,8 +117,8 @@ def series_paths(series: Sequence[TrialSeries], replays: Sequence[str]) -> list[
 
 
 def _is_limit(note: str) -> bool:
-    """Whether a note says what the log does not determine."""
-    return note.startswith(("not fitted", "the log has no commands"))
+    """Whether a note says what the log does not determine, or what is wrong with it."""
+    return note.startswith(("not fitted", "the log has no commands", CHECK))
 
 
 def _spoken(name: str) -> str:

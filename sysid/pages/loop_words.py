@@ -55,7 +55,7 @@ def size(one: Mapping[str, Any]) -> str:
         return f"of a size that these drives do not show (best {value:.{digits}f}{unit})"
     if above or below:
         return f"{'above' if above else 'below'} {low if above else high:.{digits}f}{unit}"
-    text = f"{value:.{digits}f}{unit} ({low:.{digits}f} to {high:.{digits}f})"
+    text = f"{value:z.{digits}f}{unit} ({low:.{digits}f} to {high:.{digits}f})"
     was = one.get("was")
     return text if was is None or not _differs(one) else f"{text}, before {factor * was:.{digits}f}"
 
@@ -198,10 +198,12 @@ def _may_be_none(one: Mapping[str, Any]) -> bool:
 
 
 def _differs(one: Mapping[str, Any]) -> bool:
-    """Whether a parameter had a size before that is surely more than none."""
+    """Whether a parameter had a size before that is surely more than none, or was further from none than it is now."""
     was, neutral = one.get("was"), one.get("neutral")
+    if was is None or not math.isfinite(was) or neutral is None:
+        return was is not None and math.isfinite(was)
     low, high = one["interval"]
-    return was is not None and math.isfinite(was) and (neutral is None or abs(was - neutral) > (high - low) / 2)
+    return abs(was - neutral) > min((high - low) / 2, abs(one["value"] - neutral))
 
 
 def _digits(low: float, high: float) -> int:

@@ -117,9 +117,10 @@ def _close_loop(model: mujoco.MjModel, nominal: mujoco.MjModel, robot: Robot, kp
     """Put the speed controller before motors into their law: torque = gain kp (target - speed)."""
     for one in robot.actuators:
         gain, gear = model.actuator_gainprm[one, 0], model.actuator_gear[one, 0]
+        slope = abs(gain) * kp / abs(gear)  # a gear may turn the motor the other way round
         model.actuator_biastype[one] = int(mujoco.mjtBias.mjBIAS_AFFINE)
-        model.actuator_gainprm[one, 0] = gain * kp / gear
-        model.actuator_biasprm[one, :3] = 0.0, 0.0, -gain * kp / gear
+        model.actuator_gainprm[one, 0] = slope
+        model.actuator_biasprm[one, :3] = 0.0, 0.0, -slope
         if nominal.actuator_ctrllimited[one]:
             limits = np.sort(nominal.actuator_ctrlrange[one] * gain)
             if nominal.actuator_forcelimited[one]:
