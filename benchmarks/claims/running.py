@@ -90,7 +90,7 @@ CLAIMS = (
         "Every fault, and the first zero after it",
         "bridge",
         "Time from the fault to the first zero that the base hears. After a foreign command: to the last own command.",
-        ("fault", "reaction [ms]", "range"),
+        ("fault", "reaction [ms]; {faults_load_average} processes wanted a core", "range"),
         _faults,
     ),
     Claim(
