@@ -49,9 +49,9 @@ from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.floor import floor_change
-from sysid.verdict.found import Thresholds
 from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.preparation import reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result
 from sysid.verdict.vehicles import fitted_after, fitted_before, named_alone, on_other_floor, refit_poses

@@ -36,7 +36,7 @@ from sysid.verdict.pipeline import check_logs, watched
 from sysid.verdict.result import LoopConfig
 
 KIND = "sysid.close_loop"
-OUTPUTS = ("next_command.csv", "method.html", "steps")
+OUTPUTS = ("next_command.csv", "method.html", "evidence.json", "steps")
 STOPPED = "stopped; give the same command again to go on."
 
 

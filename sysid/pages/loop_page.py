@@ -28,6 +28,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections = [Section("What was found", found(report))]
     if report["effects"]:
         sections.append(Section("How large it is", effects(report)))
+    if report["weights"]:
+        sections.append(Section("How sure it is", weights(report)))
     if report["next_manoeuvre"] is not None:
         sections.append(Section("Next drive", next_drive(report["next_manoeuvre"])))
     sections += [Section("All drives", errors(report)), Section("Each manoeuvre", by_manoeuvre(report))]
@@ -76,6 +78,16 @@ def effects(report: dict[str, Any]) -> str:
         parts.append(bullets(left_open))
     parts.append(bullets([f"{spoken(one['name'])}: {one['equation']}" for one in report["effects"] if one["equation"]]))
     return "".join(parts)
+
+
+def weights(report: dict[str, Any]) -> str:
+    """Posterior weights as bars."""
+    words = {"none": "nothing", "noise": "only the noise", "unknown": "something unknown"}
+    named = {words.get(name) or " and ".join(spoken(one) for one in name.split(" + ")): weight
+             for name, weight in report["weights"].items()}
+    chart = bar_chart(list(named), {"weight": list(named.values())}, "posterior weight", log_y=False)
+    return charts([chart], "What is missing: posterior weights of nothing, of effects and pairs of them, and of "
+                           "something that the catalogue does not have")
 
 
 def evidence(report: dict[str, Any]) -> str:

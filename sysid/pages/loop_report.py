@@ -31,8 +31,10 @@
                       noise, as a share of it, before and after; share `explained` of what could be predicted; of
                       simulated days that were refitted (`--refit-nulls`, else null) count, calibrated p-value, false
                       alarms and the upper 95 % bound of their rate
-    steps             the numbers behind the verdict: gain of each set of effects, and what it leaves that replicates
-                      have in common, smooth functions predict, or may be at random (`sysid.verdict.rounds.Asked`)
+    weights           posterior weights of `none` or `noise`, of sets of effects (" + " between them), of `unknown`
+    steps             the sets of effects that were weighed: gain, gain of each effect beside other forms of the others
+                      (`own`) and its p-value, what is left that replicates have in common, smooth functions predict, or
+                      may be at random, and the share explained (`sysid.verdict.posterior.Findings`)
     operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
                       of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
                       the share of simulated days on which it would be noticed, at factors on its size
@@ -155,7 +157,7 @@ def make_report(result: Result) -> dict[str, Any]:
                     "null_refits": None if nulls is None else {
                         "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
                         "upper": nulls.upper}},
-        "steps": found.steps,
+        "weights": found.weights, "steps": steps(result),
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
@@ -249,6 +251,16 @@ def operating(result: Result, days: Days) -> dict[str, Any]:
                 power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
     return {"alpha": alpha, "decisions": EFFORT.rounds + 2, "days": "simulated, linear",
             "false_alarms": false_alarms(days, alpha), "power": power}
+
+
+def steps(result: Result) -> list[dict[str, Any]]:
+    """The sets of effects that were weighed: what they gain, and what they leave though it could be predicted."""
+    findings, priors = result.search.findings, result.config.thresholds
+    if findings is None:
+        return []
+    return [{"effects": list(one.variants), "gain": one.gain, "own": list(one.own), "p": list(one.p),
+             "left": findings.predictable(one.left, priors.form**2, priors.alpha),
+             "share": findings.named(one, priors)} for one in findings.sets]
 
 
 def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
@@ -434,6 +446,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     from sysid.pages.loop_page import write_page
     from sysid.pages.method_page import write_method
     from sysid.pages.report import write_report
+    from sysid.verdict.posterior import write as write_evidence
     from whill_mjx.vehicle.vehicle_file import save_vehicle
 
     out = Path(out)
@@ -449,6 +462,8 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
                   "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],
                   "effects_added": [one["name"] for one in report["effects"]] + ["unnamed"] * kept})
     write_next_command(out, report["next_manoeuvre"])
+    if result.search.findings is not None:
+        write_evidence(out / "evidence.json", result.search.findings)
     write_report(out / "report.json", report)
     write_page(out, report)
     write_method(out, report)

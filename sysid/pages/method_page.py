@@ -72,7 +72,7 @@ def candidates(report: dict[str, Any]) -> str:
                              one["p_value"]] for one in each], f"round {number}"))
     left = ("common", "smooth", "any")
     rows = [[" and ".join(one["effects"]), one["gain"], *(one["left"].get(key, "") for key in left),
-             f"{one['share']:.0%}"] for one in report["steps"] if "share" in one]
+             f"{one['share']:.0%}"] for one in report["steps"]]
     if rows:
         parts.append(table(["effects", "gain", "replicates share", "smooth functions predict", "may be at random",
                             "share"], rows, "what they gain, and what they leave though it could be predicted"))

@@ -18,9 +18,10 @@ from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import make_batch, path_of
 from sysid.verdict import alone
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
-from sysid.verdict.found import Candidate, Effort, Thresholds
+from sysid.verdict.found import Candidate, Effort
+from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
-from sysid.verdict.rounds import NOTHING, Asked, begin
+from sysid.verdict.rounds import Asked, begin
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 
