@@ -142,10 +142,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     elif bags:
         spec = _spec(config)
         drives, notes, wheels = _any_drives(bags, config, spec)
-        loose = [one for drive in text_files(config.source) for one in drive if one.suffix.lower() != ".txt"]
-        if loose:
-            notes.append(f"left out: {counted(len(loose), 'table')} beside the bags ({loose[0]}). Convert tables by "
-                         "themselves")
+        notes += _tables_beside(config.source)
         if wheels:
             more["input"] = "wheels"
     else:
@@ -168,6 +165,13 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
+
+
+def _tables_beside(source: Path) -> list[str]:
+    """A note on tables in a folder of bags, which are not read."""
+    loose = [one for drive in text_files(source) for one in drive if one.suffix.lower() != ".txt"]
+    return [f"left out: {counted(len(loose), 'table')} beside the bags ({loose[0]}). Convert tables by themselves"
+            ] if loose else []
 
 
 def _any_drives(

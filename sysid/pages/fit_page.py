@@ -63,7 +63,7 @@ def summary(report: dict[str, Any], series: Sequence[TrialSeries]) -> str:
     held, train = report["summary"]["held_out"], report["summary"]["training"]
     dataset = report["dataset"]
     notes = dataset.get("notes") or []
-    parts = [paragraph(" ".join(lead(report)[1:])), *(paragraph(f"{note[0].upper()}{note[1:]}.")
+    parts = [paragraph(" ".join(lead(report)[1:])), *(paragraph(f"{note[0].upper()}{note[1:].rstrip('.')}.")
                                                           for note in notes if _is_limit(note))]
     shown = shown_drive(series_paths(series, list(REPLAY_WORDS)))
     if shown is not None:
@@ -91,7 +91,7 @@ def lead(report: dict[str, Any]) -> list[str]:
     changed = "; ".join(f"{_spoken(one['name'])} from {number(one['initial'])} to {number(one['value'])}"
                         + ("" if one["unit"] == "-" else f" {one['unit']}") for one in moved)
     second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; "
-              f"{f'most surely changed: {changed}' if moved else 'none is surely other than it was'}."
+              f"{f'most surely changed: {changed}' if moved else 'none surely changed'}."
               if known else "This log determines none of the parameters.")
     if not report["summary"]["held_out"]:
         third = "Nothing was held out, so how well the vehicle predicts other drives is not known."
