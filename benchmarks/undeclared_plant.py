@@ -300,12 +300,14 @@ def replay(work: Path) -> None:
             continue
         findings = from_json(content["findings"])
         judged = posterior(findings, Thresholds())
-        before = {one["name"]: one for one in content["effects"]}
+        before = {one["name"]: one["parameters"] for one in content["effects"]}
         content.update(verdict=judged.verdict, share=judged.share, weights=judged.weights)
         chosen = None if judged.chosen is None else findings.sets[judged.chosen]
+        if chosen is not None and set(before) != set(chosen.effects):
+            before = {}
         content["excess"][1] = findings.excess if chosen is None else chosen.left.excess
         content["effects"] = [] if chosen is None or judged.verdict != "named" else [
-            {"name": name, "class": members[:LARGEST], "parameters": before.get(name, {}).get("parameters", {}),
+            {"name": name, "class": members[:LARGEST], "parameters": before.get(name, {}),
              "p_value": p} for name, members, p in zip(chosen.effects, chosen.apart(), chosen.p, strict=True)]
         write_report(path, content)
 

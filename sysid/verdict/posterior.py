@@ -22,6 +22,8 @@ from whill_mjx.io.reading import read_json
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
 KIND = "sysid-evidence"
 AGAIN = "Give evidence.json of a run of sysid.close_loop."
+MOST = 2
+"""Effects that are named together. A third one is only tried to see whether the first stood in for two."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def choose(findings: Findings, priors: Thresholds) -> int | None:
 
     Every effect of it must be significant and more than another form of the others.
     """
-    able = [i for i, one in enumerate(findings.sets) if findings.own(one, priors)]
+    able = [i for i, one in enumerate(findings.sets) if len(one.effects) <= MOST and findings.own(one, priors)]
     return max(able, key=lambda i: findings.log_weight(findings.sets[i].gain, len(findings.sets[i].effects), priors),
                default=None)
 
@@ -254,7 +256,7 @@ def _weights(findings: Findings, priors: Thresholds, chosen: int | None) -> dict
     out = {nothing: float(weight)}
     if not findings.sets:
         return out
-    able = {i for i, one in enumerate(findings.sets) if findings.own(one, priors)}
+    able = {i for i, one in enumerate(findings.sets) if len(one.effects) <= MOST and findings.own(one, priors)}
     names, logs = [], []
     for i, one in enumerate(findings.sets):
         if (i in able or i == chosen) and not findings.against.get("+".join(one.effects)):

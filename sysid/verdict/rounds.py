@@ -290,7 +290,7 @@ def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> 
     near: dict[str, float] = {}
     for other in candidates:
         imitated = float(similar[mine, hypotheses.index(other.hypothesis)]) ** 2
-        ratio = other.gain / best.gain
+        ratio = other.gain / max(best.gain, 1e-9)
         own = (ratio - imitated) / max(1 - imitated, 1e-9)
         if best.gain - other.gain < -2 * np.log(thresholds.alpha) or own > thresholds.form:
             near[other.hypothesis.effect] = ratio
