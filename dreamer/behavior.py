@@ -110,20 +110,6 @@ def imagine(config: DreamerConfig, params: Params, start: Latent, key: jax.Array
         return Latent(deter, stoch), (latent.features(), action)
 
     unroll = min(config.scan_unroll, steps)
-    import os
-    if "C" in os.environ.get("LV", "ABCD"):
-        def write(carry, x):
-            latent, features, taken = carry
-            step, uniform, noise = x
-            features = jax.lax.dynamic_update_index_in_dim(features, latent.features(), step, 0)
-            latent, (_, action) = advance(latent, (uniform, noise))
-            taken = jax.lax.dynamic_update_index_in_dim(taken, action, step, 0)
-            return (latent, features, taken), None
-        width = config.deter + config.stoch_size
-        shape = jax.eval_shape(act, start, draws[0])
-        begin = (start, jnp.zeros((steps + 1, rows, width), start.deter.dtype), jnp.zeros((steps + 1, *shape.shape), shape.dtype))
-        (last, features, taken), _ = jax.lax.scan(write, begin, (jnp.arange(steps), uniform, draws[:-1]), unroll=unroll)
-        return Imagined(features.at[steps].set(last.features()), taken.at[steps].set(act(last, draws[-1])))
     last, (features, taken) = jax.lax.scan(advance, start, (uniform, draws[:-1]), unroll=unroll)
     return Imagined(
         jnp.concatenate([features, last.features()[None]]), jnp.concatenate([taken, act(last, draws[-1])[None]])
@@ -200,9 +186,9 @@ def imagination_loss(
     weight = jnp.cumprod(alive, 0)
     norm = update_return_norm(config, norm, returns)
     advantage = (returns - value[:-1]) / norm.scale()
-    actions, raw = spaces.actions_of(params), world_model.head(params["policy"], features)[:-1]
+    actions, raw = spaces.actions_of(params), world_model.head(params["policy"], features[:-1])
     log_prob, entropy = actions.score(config, raw, rollout.actions[:-1])
-    slow_logits = world_model.head(slow, features)[:-1]
+    slow_logits = world_model.head(slow, features[:-1])
     pull = config.mean_pull * stop(weight[:-1]) * actions.saturation(raw) if config.mean_pull else 0.0
     losses = {
         "policy": actor_loss(config, log_prob, entropy, advantage, weight[:-1]) + pull,

@@ -36,32 +36,7 @@ def conv(x: jax.Array, weight: jax.Array) -> jax.Array:
 
 def block_max(x: jax.Array) -> jax.Array:
     """Largest of each block's four values: (M, H, W, 4, O) -> (M, H, W, O)."""
-    import os
-    if "D" in os.environ.get("LV", "ABCD"):
-        return block_max_packed(x)
     return block_max_on_cpu(x) if jax.default_backend() == "cpu" else x.max(-2)
-
-
-@jax.custom_vjp
-def block_max_packed(x: jax.Array) -> jax.Array:
-    """`block_max` whose gradient needs four bits of each block instead of its values and of several passes."""
-    return x.max(-2)
-
-
-def _packed_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    values = [x[..., i, :] for i in range(4)]
-    y = jnp.maximum(jnp.maximum(values[0], values[1]), jnp.maximum(values[2], values[3]))
-    best = sum(((one == y).astype(jnp.uint8) << i for i, one in enumerate(values)), jnp.zeros(y.shape, jnp.uint8))
-    return y, best
-
-
-def _packed_backward(best: jax.Array, cotangent: jax.Array) -> tuple[jax.Array]:
-    share = cotangent / jax.lax.population_count(best).astype(cotangent.dtype)
-    chosen = (best[..., None, :] >> jnp.arange(4, dtype=jnp.uint8)[:, None]) & 1
-    return (jnp.where(chosen == 1, share[..., None, :], 0),)
-
-
-block_max_packed.defvjp(_packed_forward, _packed_backward)
 
 
 def convolve(x: jax.Array, weight: jax.Array) -> jax.Array:

@@ -75,13 +75,6 @@ def sample_index(probs: jax.Array, uniform: jax.Array) -> jax.Array:
         probs: (..., S, C).
         uniform: (..., S) in [0, 1).
     """
-    import os
-    if "B" in os.environ.get("LV", "ABCD"):
-        cumulative, index = jnp.zeros_like(uniform), jnp.zeros(uniform.shape, jnp.int32)
-        for one in range(probs.shape[-1] - 1):
-            cumulative += probs[..., one]
-            index += uniform >= cumulative
-        return index
     cumulative = jnp.cumsum(probs[..., :-1], -1)
     return jnp.sum((uniform[..., None] >= cumulative).astype(jnp.int32), -1)
 

@@ -2,7 +2,8 @@
 
 Differentiating an ordinary scan adds a weight gradient at every step of the backward pass: T small products and T
 read-modify-writes of every weight. Here the backward scan only returns the cotangent of each product, and the weight
-gradient is one product over T * B rows, accumulated in float32.
+gradient is one product over T * B rows, accumulated in float32. Of each step the backward pass keeps what `keep` marks,
+results of products and of sums, and computes the rest again: that is cheaper than writing and reading it.
 """
 
 from __future__ import annotations
@@ -64,8 +65,7 @@ def _run(
 def _forward(
     step: Step, unroll: int, weights: dict[str, jax.Array], carry: Tree, terms: dict[str, jax.Array], inputs: Tree
 ) -> tuple[Any, Any]:
-    import os
-    lean = step if "A" not in os.environ.get("LV", "ABCD") else jax.checkpoint(step, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
+    lean = jax.checkpoint(step, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
 
     def run(carry: Tree, terms: dict[str, jax.Array]) -> tuple[Any, dict[str, jax.Array]]:
         return _run(lean, unroll, weights, carry, terms, inputs)
