@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import jax
@@ -205,6 +206,9 @@ class Arrays:
 
     def wherever(self, mask, make, otherwise) -> Any:
         return make()
+
+    def cast_by(self, count, darker, share) -> Any:
+        return reduce(lambda share, index: darker(index, share), range(count), share)
 
     def small(self, integer) -> jax.Array:
         return integer.astype(jnp.float32)
