@@ -253,7 +253,8 @@ def main(options: Options) -> None:
         parts = [moving(of_blocks(tracks, odd))[:, 4] for odd in (False, True)]
         found["within"].append(largest_gap(*parts))
         flow_line = ", ".join(f"{bin}: {error:+.1%}" for bin, error in errors.items())
-        print(f"{name}: {len(tracks)} people; speeds {found['speed'][-1]:.3f} apart, {found['fitted'][-1]:.3f} if fitted to all (the recording's own two halves "
+        print(f"{name}: {len(tracks)} people; speeds {found['speed'][-1]:.3f} apart, {found['fitted'][-1]:.3f} "
+              f"if fitted to all (the recording's own two halves "
               f"{found['within'][-1]:.3f}); headway median "
               f"{np.median(times[0]):.2f} s recorded, {np.median(times[1]):.2f} s simulated, "
               f"{found['headway'][-1]:.3f} apart; flow {flow_line}", flush=True)  # fmt: skip
