@@ -342,9 +342,8 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
     "black": {"value": (0.01, 0.08), "saturation": (0.0, 0.2)},
     "metal": {"value": (0.15, 0.7), "saturation": (0.0, 0.05), "grain_s": (0.2, 0.5), "grain_t": (0.004, 0.01)},
 }  # fmt: skip
-BOLD, BOLDEST, CALM = 0.5, 4.0, 0.15
-"""Share of the worlds whose patterns and colours are bolder than usual, and by how much they are at most; share of
-those where they are weaker, down to none."""
+BOLD, BOLDEST = 0.5, 4.0
+"""Share of the worlds whose patterns and colours are bolder than usual, and by how much they are at most."""
 BOLD_LIMITS = {"joint": (0.0, 0.03), "joint_tone": (-1.5, 0.95), "tone": (0.0, 0.7), "blotch": (0.0, 0.6),
                "grain": (0.0, 0.7)}  # fmt: skip
 WARM = ("brick", "planks", "cardboard")
@@ -443,12 +442,11 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
 
 
 def _bold(value: dict[str, jax.Array], chance: jax.Array, size: jax.Array) -> dict[str, jax.Array]:
-    """Properties of a world that is drawn bolder or calmer than its materials usually are, for a share of the worlds.
+    """Properties of a world that is drawn bolder than its materials usually are, for a BOLD share of the worlds.
 
-    The ranges are those of real materials. A policy that has seen no stronger pattern or colour takes one for a thing,
-    and one that has seen no bare wall may miss where it ends.
+    The ranges are those of real materials; a policy that has seen no stronger pattern or colour takes one for a thing.
     """
-    times = jnp.where(chance < BOLD, 1.0 + (BOLDEST - 1.0) * size, jnp.where(chance < BOLD + CALM, size, 1.0))
+    times = jnp.where(chance < BOLD, 1.0 + (BOLDEST - 1.0) * size, 1.0)
     wider = {name: jnp.clip(times * value[name], *limits) for name, limits in BOLD_LIMITS.items()}
     second = jnp.clip(value["second"], 0.05) ** times
     saturation = jnp.clip(value["saturation"] + (times - 1.0) * 0.25 * value["saturation"] ** 0.5, 0.0, 1.0)
