@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import jax
@@ -206,9 +205,6 @@ class Arrays:
 
     def wherever(self, mask, make, otherwise) -> Any:
         return make()
-
-    def cast_by(self, count, darker, share) -> Any:
-        return reduce(lambda share, index: darker(index, share), range(count), share)
 
     def small(self, integer) -> jax.Array:
         return integer.astype(jnp.float32)

@@ -20,7 +20,7 @@ from flax import struct
 from whill_mjx.world.render import culling, visibility
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
-from whill_mjx.world.render.rich import packed, shadow_boxes, unpacked
+from whill_mjx.world.render.rich import NUMBERS
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
 from whill_mjx.world.render.tables import lit_words, make_tables, parts_of
 from whill_mjx.world.render.textures import floors, whole
@@ -85,8 +85,7 @@ class Inputs:
     bent: Any  # (K * 4 * 8,)
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
-    materials: Any = None  # (labels * NUMBERS / 2,) int32 of rich looks
-    soft: Any = None  # (4, C padded) rectangles of their soft shadows
+    materials: Any = None  # (labels * NUMBERS,) of rich looks
 
 
 class Kind(NamedTuple):
@@ -108,17 +107,6 @@ class Numbers:
     def __getitem__(self, place: Any) -> jax.Array:
         row, column = place
         return self.floats[self.first + row * self.shape[1] + column]
-
-
-class FaceRow:
-    """A row of `tables.face_rows`, of which what only curved faces need is read where it is used."""
-
-    def __init__(self, rows: Any, first: jax.Array) -> None:
-        self.rows, self.first = rows, first
-        self.read = {index: rows[first + index] for index in (*range(3), *range(7, 18))}
-
-    def __getitem__(self, index: int) -> jax.Array:
-        return self.read[index] if index in self.read else self.rows[self.first + index]
 
 
 class Tile(NamedTuple):
@@ -266,13 +254,9 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort
     dark = None if tables.dark is None else tables.dark.reshape(-1)
     rows = None if lit_words(scene) or tables.rows is None else tables.rows.reshape(-1)
     bent = None if tables.bent is None else tables.bent.reshape(-1)
-    materials = None if tables.materials is None else packed(tables.materials)
-    soft = None
-    if scene.rich is not None:
-        boxes = shadow_boxes(scene.rich.lights.caster)
-        soft = _padded(_sides(culling.upright_bounds(view, boxes)))
+    materials = None if tables.materials is None else tables.materials.reshape(-1)
     floats, words = jnp.concatenate(flat), tables.words.reshape(-1)
-    return Inputs(floats, integers, words, dark, rows, bent, atlas, listed, materials, soft), rebuild
+    return Inputs(floats, integers, words, dark, rows, bent, atlas, listed, materials), rebuild
 
 
 def _listed(view: View, corners, sun, kind: Kind, sort: bool) -> Listed:
@@ -287,22 +271,16 @@ def _listed(view: View, corners, sun, kind: Kind, sort: bool) -> Listed:
         boxes = jax.tree.map(lambda leaf: leaf[order], boxes)
         order = jnp.pad(order.astype(jnp.int32), (0, extra))
 
+    def pad(values):
+        empty = [culling.NOTHING, -culling.NOTHING, culling.NOTHING, -culling.NOTHING, culling.NOTHING]
+        return jnp.stack([jnp.pad(v, (0, extra), constant_values=e) for v, e in zip(values, empty, strict=False)])
+
+    sides = (boxes.low_u, boxes.high_u, boxes.low_v, boxes.high_v)
     dark = None
     if shadow is not None:
         cast = culling.bounds(view, culling.shadow_corners(corners, sun), mask, culling.SHADOW_EDGES)
-        dark = _padded(_sides(cast))
-    return Listed(table, _padded((*_sides(boxes), boxes.near)), order, shadow, dark)
-
-
-def _sides(boxes: culling.Bounds) -> tuple[jax.Array, ...]:
-    return boxes.low_u, boxes.high_u, boxes.low_v, boxes.high_v
-
-
-def _padded(values: tuple[jax.Array, ...]) -> jax.Array:
-    """(n, P padded to CHUNK) numbers of rectangles; those that are added are empty."""
-    extra = -values[0].shape[0] % CHUNK
-    empty = [culling.NOTHING, -culling.NOTHING, culling.NOTHING, -culling.NOTHING, culling.NOTHING]
-    return jnp.stack([jnp.pad(v, (0, extra), constant_values=e) for v, e in zip(values, empty, strict=False)])
+        dark = pad((cast.low_u, cast.high_u, cast.low_v, cast.high_v))
+    return Listed(table, pad((*sides, boxes.near)), order, shadow, dark)
 
 
 def _first_labels(scene: Scene) -> dict[str, int]:
@@ -452,11 +430,11 @@ class Refs:
     def dark_word(self, code) -> jax.Array:
         return self.data.dark[code]
 
-    def row(self, code) -> Any:
-        return FaceRow(self.data.rows, code * 18)
+    def row(self, code) -> list:
+        return [self.data.rows[code * 18 + index] for index in range(18)]
 
     def material(self, label) -> list:
-        return unpacked(self.data.materials, label)
+        return [self.data.materials[label * NUMBERS + index] for index in range(NUMBERS)]
 
     def bent(self, place) -> list:
         return [self.data.bent[place * 8 + index] for index in range(8)]
@@ -478,9 +456,6 @@ class Refs:
     def wherever(self, mask, make, otherwise) -> Any:
         anywhere = mask if jnp.ndim(mask) == 0 else jnp.max(mask.astype(jnp.int32)) > 0
         return jax.lax.cond(anywhere, make, lambda: otherwise)
-
-    def cast_by(self, count, darker, share) -> Any:
-        return self._visit(self.data.soft, None, darker, share)
 
     def small(self, integer) -> jax.Array:
         return fast_small(integer) if self.fast else integer.astype(jnp.float32)

@@ -1,12 +1,12 @@
 """Colour of what a ray meets in a world with rich looks: procedural materials, lamps, soft shadows, sunlight, gloss.
 
 One formula draws all materials: cells with joints, a tone by cell, blotches and grain. Which one it is, is numbers of
-its label. Elementwise, shared by both renderers; the kernel leaves out what no pixel of a tile shows.
+its label, so that a pixel costs the same whatever it shows. Elementwise, shared by both renderers.
 """
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,7 +15,6 @@ import numpy as np
 
 from whill_mjx.world.render.textures import random_of, smooth_noise
 from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
-from whill_mjx.world.scene import Boxes
 
 NUMBERS = 26
 """Numbers of a material in the table."""
@@ -23,12 +22,8 @@ WRAP = 0.3
 """Share of a lamp's light that comes around corners: lamps are wide, and walls throw light back."""
 
 
-SOFT = (0.06, 0.35)
-"""Width of a shadow's soft border at the foot of a thing [m], and by how much it widens per metre below its top."""
-
-
 def material_table(materials: Any) -> jax.Array:
-    """(L, NUMBERS) of materials, to three digits, so that two fit into a word: see `_paint` for the places."""
+    """(L, NUMBERS) of materials: see `shade_rich` for the places."""
     inverse = 1.0 / jnp.maximum(materials.cell, 1e-3)
     columns = [
         materials.paint, materials.second, materials.band_paint, inverse, materials.shift[:, None],
@@ -37,20 +32,7 @@ def material_table(materials: Any) -> jax.Array:
         materials.grain[:, None], 1.0 / materials.grain_size, materials.band, materials.glow[:, None],
         materials.gloss[:, None],
     ]  # fmt: skip
-    return jax.lax.reduce_precision(jnp.concatenate(columns, 1), 8, 7)
-
-
-def packed(table: jax.Array) -> jax.Array:
-    """(L * NUMBERS / 2,) int32 of a `material_table`: each holds the upper halves of two of its numbers."""
-    low, high = (jax.lax.bitcast_convert_type(half, jnp.uint32) for half in (table[:, 0::2], table[:, 1::2]))
-    return jax.lax.bitcast_convert_type(low >> 16 | high, jnp.int32).reshape(-1)
-
-
-def unpacked(words: Any, label: jax.Array) -> list:
-    """Numbers of a label's material."""
-    pairs = [words[label * (NUMBERS // 2) + index] for index in range(NUMBERS // 2)]
-    halves = [half for pair in pairs for half in (pair << 16, pair & np.int32(-65536))]
-    return [jax.lax.bitcast_convert_type(half, jnp.float32) for half in halves]
+    return jnp.concatenate(columns, 1)
 
 
 def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
@@ -60,7 +42,7 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     point = [view.position[i] + depth * way for i, way in enumerate((rays.x, rays.y, rays.z))]
     code = jnp.where(hit.solid, hit.code, 4 * GROUND)
     row, m = stage.row(code), stage.material(code >> 2)
-    normal = stage.wherever(row[7] > 0, lambda: face_normal(row, *point), [row[axis] for axis in range(3)])
+    normal = face_normal(row, *point)
     length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
     facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
@@ -153,21 +135,11 @@ def _in_patch(lights, point) -> jax.Array:
 
 def shadow_factor(casters, x, y, z, stage) -> jax.Array:
     """Share of the light that things leave to a point: soft, darkest at their foot, and away from the lamps."""
-
-    def darker(index, share):
-        return share * _left_by(casters, index, x, y, z, stage)
-
-    return stage.cast_by(casters.shape[0], darker, jnp.ones_like(x))
-
-
-def shadow_boxes(casters: jax.Array) -> Boxes:
-    """Boxes that hold every point of a room at which things (C, 10) take light."""
-    half, height, shift = casters[:, 4:6], casters[:, 6], jnp.abs(casters[:, 7:9])
-    reach = (0.5 * jnp.max(shift, 1) + 0.5 * jnp.sum(shift, 1) + SOFT[1]) * height + SOFT[0]
-    middle = jnp.concatenate([casters[:, :2], 0.5 * height[:, None]], 1)
-    size = jnp.concatenate([half + reach[:, None], 0.5 * height[:, None] + 0.01], 1)
-    yaw, colour = jnp.arctan2(casters[:, 3], casters[:, 2]), jnp.ones((casters.shape[0], 3))
-    return Boxes(middle, size, yaw, colour, casters[:, 9] > 0.0)
+    factor = jnp.ones_like(x)
+    for index in range(casters.shape[0]):
+        cast = partial(_left_by, casters, index, x, y, z, stage)
+        factor = stage.wherever(casters[index, 9] > 0.0, lambda cast=cast, left=factor: left * cast(), factor)
+    return factor
 
 
 def _left_by(casters, index, x, y, z, stage) -> jax.Array:
@@ -178,7 +150,7 @@ def _left_by(casters, index, x, y, z, stage) -> jax.Array:
     along, across = jnp.abs(dx * c[2] + dy * c[3]), jnp.abs(dy * c[2] - dx * c[3])
     reach = 0.5 * rise * jnp.maximum(jnp.abs(c[7]), jnp.abs(c[8]))
     out = jnp.maximum(along - c[4], across - c[5]) - reach
-    soft = jnp.clip(1.0 - out * stage.invert(SOFT[0] + SOFT[1] * rise), 0.0, 1.0)
+    soft = jnp.clip(1.0 - out * stage.invert(0.06 + 0.35 * rise), 0.0, 1.0)
     return 1.0 - c[9] * soft * soft * jnp.minimum(rise * 4.0, 1.0)
 
 
@@ -201,10 +173,6 @@ class _Point:
     @staticmethod
     def invert(x) -> jax.Array:
         return 1.0 / x
-
-    @staticmethod
-    def cast_by(count, darker, share) -> jax.Array:
-        return reduce(lambda share, index: darker(index, share), range(count), share)
 
     @staticmethod
     def wherever(mask, make, otherwise) -> jax.Array:

@@ -106,9 +106,6 @@ class Stage(Protocol):
     def wherever(self, mask, make, otherwise) -> Any:
         """`make()` where `mask` holds, and either that or `otherwise` elsewhere; free where it holds nowhere."""
 
-    def cast_by(self, count, darker, share) -> Any:
-        """`share` after `darker(index, share)` for each of the things whose soft shadow can be seen."""
-
     def small(self, integer) -> Any:
         """A uint32 below 2^23 as float."""
 
