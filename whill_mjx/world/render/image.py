@@ -19,7 +19,7 @@ from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.render.culling import strip_lists, upright_bounds
 from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
-from whill_mjx.world.render.textures import floors, whole
+from whill_mjx.world.render.textures import whole
 from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal
 from whill_mjx.world.scene import Scene
 
@@ -199,12 +199,6 @@ class Arrays:
 
     def whole(self, x) -> jax.Array:
         return whole(x)
-
-    def floors(self, x) -> tuple:
-        return floors(x)
-
-    def wherever(self, mask, make, otherwise) -> Any:
-        return make()
 
     def small(self, integer) -> jax.Array:
         return integer.astype(jnp.float32)

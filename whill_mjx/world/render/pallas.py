@@ -23,14 +23,12 @@ from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
 from whill_mjx.world.render.rich import NUMBERS
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
 from whill_mjx.world.render.tables import lit_words, make_tables, parts_of
-from whill_mjx.world.render.textures import floors, whole
+from whill_mjx.world.render.textures import whole
 from whill_mjx.world.render.visibility import FAR, MARKER, Rays, key_of
 from whill_mjx.world.scene import Scene
 
 CHUNK = 32
 """Rectangles compared at once: the bits of an integer."""
-FEW = 32
-"""Numbers of an array of the view that are read at once; those of a larger one are read where they are used."""
 
 
 @dataclass(frozen=True)
@@ -94,19 +92,6 @@ class Kind(NamedTuple):
     table: Any  # (N, numbers)
     mask: jax.Array
     shadow: jax.Array | None
-
-
-@dataclass(frozen=True, eq=False)
-class Numbers:
-    """An array (rows, columns) of the view that is read number by number."""
-
-    floats: Any
-    first: int
-    shape: tuple[int, ...]
-
-    def __getitem__(self, place: Any) -> jax.Array:
-        row, column = place
-        return self.floats[self.first + row * self.shape[1] + column]
 
 
 class Tile(NamedTuple):
@@ -233,12 +218,9 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort
     def rebuild(data: Inputs) -> View:
         values, offset = [], 0
         for index, shape in enumerate(shapes):
-            size, first = int(np.prod(shape)), offset
+            size = int(np.prod(shape))
+            scalars = [data.floats[offset + i] for i in range(size)]
             offset += size
-            if size > FEW:
-                values.append(Numbers(data.floats, first, shape))
-                continue
-            scalars = [data.floats[first + i] for i in range(size)]
             if index == where_seed:
                 values.append(data.integers[0].astype(jnp.uint32))
             elif shape == ():
@@ -327,12 +309,6 @@ def fast_whole(x):
     """
     shifted = (x - 0.5) + np.float32(1.5 * 2.0**23)
     return jax.lax.bitcast_convert_type(shifted, jnp.int32) - np.int32(0x4B400000)
-
-
-def fast_floors(x) -> tuple:
-    """The same as an integer and as a float."""
-    shifted = (x - 0.5) + np.float32(1.5 * 2.0**23)
-    return jax.lax.bitcast_convert_type(shifted, jnp.int32) - np.int32(0x4B400000), shifted - np.float32(1.5 * 2.0**23)
 
 
 def fast_small(integer):
@@ -449,13 +425,6 @@ class Refs:
 
     def whole(self, x) -> jax.Array:
         return fast_whole(x) if self.fast else whole(x)
-
-    def floors(self, x) -> tuple:
-        return fast_floors(x) if self.fast else floors(x)
-
-    def wherever(self, mask, make, otherwise) -> Any:
-        anywhere = mask if jnp.ndim(mask) == 0 else jnp.max(mask.astype(jnp.int32)) > 0
-        return jax.lax.cond(anywhere, make, lambda: otherwise)
 
     def small(self, integer) -> jax.Array:
         return fast_small(integer) if self.fast else integer.astype(jnp.float32)

@@ -6,14 +6,12 @@ its label, so that a pixel costs the same whatever it shows. Elementwise, shared
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from whill_mjx.world.render.textures import random_of, smooth_noise
+from whill_mjx.world.render.textures import random_cell, smooth_noise
 from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
 
 NUMBERS = 26
@@ -47,9 +45,8 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
     paint, tone = stage.settle(_paint(stage, row, m, point, pixel, code >> 2, seed))
-    light = stage.settle(_light(lights, normal, point, stage))
-    smooth = jnp.where(normal[2] > 0.9, m[25], 0.0)
-    gleam = stage.wherever(smooth > 0.0, lambda: smooth * _mirror(lights, rays, point, facing, stage), 0.0 * smooth)
+    light = stage.settle(_light(lights, normal, point))
+    gleam = m[25] * _mirror(lights, rays, point, facing) * jnp.where(normal[2] > 0.9, 1.0, 0.0)
     looks, height = view.looks, jnp.clip(rays.z * length, 0.0, 1.0)
     colours = []
     for channel in range(3):
@@ -61,53 +58,43 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
 
 
 def _paint(stage, row, m, point, pixel, label, seed) -> tuple[list, jax.Array]:
-    """Reflectance of a surface, and the factor on it of cells, joints, blotches and grain.
-
-    Edges of joints and bands are as soft as a pixel is wide, for one point of a surface is all that a pixel shows.
-    """
+    """Reflectance of a surface, and the factor on it of cells, joints, blotches and grain."""
     x, y, z = point
     s = row[8] * x + row[9] * y + row[10] * z + row[11]
     t = row[12] * x + row[13] * y + row[14] * z + row[15]
-    number = label.astype(jnp.uint32) * np.uint32(17)
-    own, sharp = stage.small(number), stage.invert(pixel + 1e-6)
+    own = stage.small(label.astype(jnp.uint32)) * 17.0
     b = t * m[10] + 0.37
-    line, low = stage.floors(b)
-    a = s * m[9] + m[11] * low + 0.19
-    column, left = stage.floors(a)
-    lot = random_of(column, line, number, seed)
-    other = lot * 61.0 - stage.floors(lot * 61.0)[1]
+    line = jnp.floor(b)
+    a = s * m[9] + m[11] * line + 0.19
+    column = jnp.floor(a)
+    lot = random_cell(column, line, own, seed, stage.whole)
+    other = lot * 61.0 - jnp.floor(lot * 61.0)
     cells = jnp.maximum(m[9], m[10]) * pixel  # cells in a pixel
-    fine = stage.invert(1.0 + 4.0 * cells * cells)
-    # How deep a point lies in a joint, in pixels; a joint is at the edge of a cell.
-    across = (jnp.abs(a - left - 0.5) + m[12] - 0.5) * stage.invert(m[9])
-    along = (jnp.abs(b - low - 0.5) + m[13] - 0.5) * stage.invert(m[10])
-    deep = jnp.clip(jnp.maximum(across, along) * sharp + 0.5, 0.0, 1.0)
-    # A joint thinner than a pixel.
-    thin = jnp.minimum(1.0, 2.0 * jnp.maximum(m[12], m[13]) * stage.invert(cells + 1e-6))
-    joint = jnp.where(jnp.maximum(m[12], m[13]) > 0.0, deep * m[14] * fine * jnp.maximum(thin, 0.35), 0.0)
-    blotch = smooth_noise(s * m[18] + own, t * m[18], seed, stage.floors) - 0.5
+    fine = stage.ratio(1.0, 1.0 + 4.0 * cells * cells)
+    at_joint = jnp.maximum(jnp.abs(a - column - 0.5) + m[12], jnp.abs(b - line - 0.5) + m[13]) > 0.5
+    thin = jnp.minimum(1.0, stage.ratio(2.0 * jnp.maximum(m[12], m[13]), cells + 1e-6))  # a joint thinner than a pixel
+    joint = jnp.where(at_joint, m[14] * fine * jnp.maximum(thin, 0.35), 0.0)
+    blotch = smooth_noise(s * m[18] + own, t * m[18], seed) - 0.5
     grains = jnp.maximum(m[20], m[21]) * pixel
-    grain = (smooth_noise(s * m[20], t * m[21] + own, seed, stage.floors) - 0.5) * stage.invert(1.0 + grains * grains)
+    grain = (smooth_noise(s * m[20], t * m[21] + own, seed) - 0.5) * stage.ratio(1.0, 1.0 + grains * grains)
     tone = (1.0 + 2.0 * m[15] * fine * (lot - 0.5)) * (1.0 + 2.0 * m[17] * blotch) * (1.0 + 2.0 * m[19] * grain)
     filled = jnp.where(other < m[16], 1.0, 0.0)
     filled = m[16] + fine * (filled - m[16])
-    band = jnp.clip(jnp.minimum(z - m[22], m[23] - z) * sharp + 0.5, 0.0, 1.0)
-    band = jnp.where(m[23] > m[22], band, 0.0)
+    banded = (z > m[22]) & (z < m[23])
     paint = []
     for channel in range(3):
         value = m[channel] + filled * (m[3 + channel] - m[channel])
-        paint.append(value + band * (m[6 + channel] - value))
-    tone = tone * (1.0 - joint)
-    return paint, jnp.maximum(tone + band * (1.0 + 0.5 * m[17] * blotch - tone), 0.0)
+        paint.append(jnp.where(banded, m[6 + channel], value))
+    return paint, jnp.maximum(jnp.where(banded, 1.0 + 0.5 * m[17] * blotch, tone * (1.0 - joint)), 0.0)
 
 
-def _light(lights, normal, point, stage) -> list:
+def _light(lights, normal, point) -> list:
     """Light on a surface, for each channel: ambient, lamps, soft shadows near the floor, and a patch of sunlight."""
     x, y, z = point
     sky = 0.8 + 0.2 * normal[2]
     near = jnp.clip((lights.half_width - jnp.abs(y)) * 4.0, 0.0, 1.0)
     corner = jnp.where(normal[2] > 0.5, 0.75 + 0.25 * near, 0.78 + 0.22 * jnp.clip(z * 4.0, 0.0, 1.0))
-    open_ = corner * shadow_factor(lights.caster, x, y, z, stage)
+    open_ = corner * shadow_factor(lights.caster, x, y, z)
     light = [lights.ambient[i] * sky * open_ for i in range(3)]
     for lamp in range(lights.position.shape[0]):
         to = [lights.position[lamp, axis] - point[axis] for axis in range(3)]
@@ -116,70 +103,46 @@ def _light(lights, normal, point, stage) -> list:
         cosine = (to[0] * normal[0] + to[1] * normal[1] + to[2] * normal[2]) * inverse
         strength = jnp.maximum(WRAP + (1.0 - WRAP) * cosine, 0.05) * inverse * inverse * open_
         light = [light[i] + strength * lights.colour[lamp, i] for i in range(3)]
-    cosine = normal[0] * lights.sun[0] + normal[1] * lights.sun[1] + normal[2] * lights.sun[2]
-    sunny = jnp.where(lights.sunlight[0] > 0.0, cosine, 0.0)
-    patch = stage.wherever(sunny > 0.0, lambda: sunny * _in_patch(lights, point), 0.0 * sunny)
-    return [light[i] + jnp.maximum(patch, 0.0) * lights.sunlight[i] for i in range(3)]
-
-
-def _in_patch(lights, point) -> jax.Array:
-    """Share of the sunlight that comes to a point through the window, with a bar in its middle."""
-    x, y, z = point
-    back = jnp.abs(lights.window[0] - y) * (1.0 / jnp.abs(lights.sun[1]))  # way back to the plane of the window
+    back = jnp.abs(lights.window[0] - y) / jnp.abs(lights.sun[1])  # way back to the plane of the window
     beside = jnp.abs(x + back * lights.sun[0] - lights.window[1])
     above = jnp.abs(z + back * lights.sun[2] - lights.window[2])
     inside = jnp.clip((lights.window[3] - beside) * 12.0, 0.0, 1.0)
     inside = inside * jnp.clip((lights.window[4] - above) * 12.0, 0.0, 1.0)
-    return inside * jnp.clip(beside * 20.0 - 0.3, 0.0, 1.0)
+    inside = inside * jnp.clip(beside * 20.0 - 0.3, 0.0, 1.0)  # the bar in the middle of the window
+    cosine = normal[0] * lights.sun[0] + normal[1] * lights.sun[1] + normal[2] * lights.sun[2]
+    patch = inside * jnp.maximum(cosine, 0.0)
+    return [light[i] + patch * lights.sunlight[i] for i in range(3)]
 
 
-def shadow_factor(casters, x, y, z, stage) -> jax.Array:
+def shadow_factor(casters, x, y, z) -> jax.Array:
     """Share of the light that things leave to a point: soft, darkest at their foot, and away from the lamps."""
     factor = jnp.ones_like(x)
     for index in range(casters.shape[0]):
-        cast = partial(_left_by, casters, index, x, y, z, stage)
-        factor = stage.wherever(casters[index, 9] > 0.0, lambda cast=cast, left=factor: left * cast(), factor)
+        c = [casters[index, i] for i in range(10)]
+        rise = jnp.maximum(c[6] - z, 0.0)  # of the thing above the point
+        dx, dy = x - c[0] - 0.5 * rise * c[7], y - c[1] - 0.5 * rise * c[8]
+        along, across = jnp.abs(dx * c[2] + dy * c[3]), jnp.abs(dy * c[2] - dx * c[3])
+        reach = 0.5 * rise * jnp.maximum(jnp.abs(c[7]), jnp.abs(c[8]))
+        out = jnp.maximum(along - c[4] - reach, across - c[5] - reach)
+        soft = jnp.clip(1.0 - out / (0.06 + 0.35 * rise), 0.0, 1.0)
+        factor = factor * (1.0 - c[9] * soft * soft * jnp.minimum(rise * 4.0, 1.0))
     return factor
 
 
-def _left_by(casters, index, x, y, z, stage) -> jax.Array:
-    """Share of the light that one thing leaves."""
-    c = [casters[index, i] for i in range(10)]
-    rise = jnp.maximum(c[6] - z, 0.0)  # of the thing above the point
-    dx, dy = x - c[0] - 0.5 * rise * c[7], y - c[1] - 0.5 * rise * c[8]
-    along, across = jnp.abs(dx * c[2] + dy * c[3]), jnp.abs(dy * c[2] - dx * c[3])
-    reach = 0.5 * rise * jnp.maximum(jnp.abs(c[7]), jnp.abs(c[8]))
-    out = jnp.maximum(along - c[4], across - c[5]) - reach
-    soft = jnp.clip(1.0 - out * stage.invert(0.06 + 0.35 * rise), 0.0, 1.0)
-    return 1.0 - c[9] * soft * soft * jnp.minimum(rise * 4.0, 1.0)
-
-
-def _mirror(lights, rays: Rays, point, facing, stage) -> jax.Array:
+def _mirror(lights, rays: Rays, point, facing) -> jax.Array:
     """Strength of the lamps' mirror image in a smooth floor."""
-    up = stage.invert(jnp.maximum(jnp.abs(rays.z), 1e-3))
+    up = jnp.maximum(jnp.abs(rays.z), 1e-3)
     total = 0.0
     for lamp in range(lights.position.shape[0]):
-        way = (lights.position[lamp, 2] - point[2]) * up
+        way = (lights.position[lamp, 2] - point[2]) / up
         dx, dy = point[0] + way * rays.x - lights.position[lamp, 0], point[1] + way * rays.y - lights.position[lamp, 1]
-        far = stage.invert(1.0 + 3.0 * (dx * dx + 4.0 * dy * dy))
-        total = total + far * far
+        far = 1.0 + 3.0 * (dx * dx + 4.0 * dy * dy)
+        total = total + 1.0 / (far * far)
     glance = 1.0 - facing
     return total * (0.08 + 0.9 * glance * glance * glance)
-
-
-class _Point:
-    """The part of a stage that the light at one point asks for."""
-
-    @staticmethod
-    def invert(x) -> jax.Array:
-        return 1.0 / x
-
-    @staticmethod
-    def wherever(mask, make, otherwise) -> jax.Array:
-        return jnp.where(mask, make(), otherwise)
 
 
 def floor_light(lights: Any, x, y) -> jax.Array:
     """() mean light on the floor and the walls near a point, for the exposure control."""
     up = (0.0, 0.0, 1.0)
-    return sum(_light(lights, up, (x, y, 0.4 + 0.0 * x), _Point)) / 3.0  # type: ignore[arg-type, return-value]
+    return sum(_light(lights, up, (x, y, 0.4 + 0.0 * x))) / 3.0  # type: ignore[arg-type, return-value]

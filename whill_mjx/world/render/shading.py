@@ -100,12 +100,6 @@ class Stage(Protocol):
     def whole(self, x) -> Any:
         """Largest integer not above x, as int32."""
 
-    def floors(self, x) -> tuple:
-        """Largest integer not above x, as int32 and as float; either neighbour where x is whole."""
-
-    def wherever(self, mask, make, otherwise) -> Any:
-        """`make()` where `mask` holds, and either that or `otherwise` elsewhere; free where it holds nowhere."""
-
     def small(self, integer) -> Any:
         """A uint32 below 2^23 as float."""
 
@@ -151,19 +145,13 @@ def pixel_colours(view: View, stage: Stage, quality: Quality, row, column) -> li
     mask = (1 << stage.bits) - 1
     front, back = jnp.min(key, 0), jnp.max(key, 0)
     share = jnp.sum(jnp.where((key & mask) == (front & mask)[None], 0.25, 0.0), 0)
-    edge = front & mask != back & mask
-    sharp = view.lights is None  # of a surface with sharp patterns its nearest and its farthest sample are shown
-    if sharp:
-        share = jnp.where(edge, share, 0.5)
-
-    def colours_of(chosen) -> list:
+    share = jnp.where(front & mask == back & mask, 0.5, share)  # one surface: its nearest and its farthest sample
+    colours = []
+    for chosen in (front, back):
         first = jnp.min(jnp.where(key == chosen[None], sample, len(SAMPLES)), 0)
         one = pixel_view(view, stage, row, column, _place(first))
-        return shade(view, stage, quality, one, _hit_of(view, stage, one, chosen))
-
-    near = colours_of(front)
-    far = colours_of(back) if sharp else stage.wherever(edge, lambda: colours_of(back), near)
-    return [jnp.where(edge | sharp, b + share * (a - b), a) for a, b in zip(near, far, strict=True)]
+        colours.append(shade(view, stage, quality, one, _hit_of(view, stage, one, chosen)))
+    return [share * a + (1.0 - share) * b for a, b in zip(*colours, strict=True)]
 
 
 def _place(sample) -> tuple:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -65,15 +64,14 @@ def _line(x, width):
     return jnp.where(jnp.abs(x - 0.5) > 0.5 - width, 1.0, 0.0)
 
 
-def smooth_noise(x, y, seed, lattice=None):
-    """Random number in [0, 1) that varies smoothly from one lattice point to the next; `lattice` as `floors`."""
-    (column, left), (row, low) = (lattice or floors)(x), (lattice or floors)(y)
-    a, b = x - left, y - low
+def smooth_noise(x, y, seed):
+    """Random number in [0, 1) that varies smoothly from one lattice point to the next."""
+    column, row = jnp.floor(x), jnp.floor(y)
+    a, b = x - column, y - row
     a, b = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b)
-    across, up = column.astype(jnp.uint32) * PRIMES[0], row.astype(jnp.uint32) * PRIMES[1]
-    rest = np.uint32(5 * int(PRIMES[2]) & 0xFFFFFFFF) ^ seed
-    corners = [[_mixed(one ^ other ^ rest) for one in (across, across + PRIMES[0])] for other in (up, up + PRIMES[1])]
-    return _between(_between(*corners[0], a), _between(*corners[1], a), b)
+    low = _between(random_cell(column, row, 5.0, seed), random_cell(column + 1.0, row, 5.0, seed), a)
+    high = _between(random_cell(column, row + 1.0, 5.0, seed), random_cell(column + 1.0, row + 1.0, 5.0, seed), a)
+    return _between(low, high, b)
 
 
 def _between(low, high, share):
@@ -85,29 +83,10 @@ def whole(x):
     return jnp.floor(jnp.asarray(x)).astype(jnp.int32)
 
 
-def floors(x) -> tuple:
-    """Largest integer not above x, as int32 and as float."""
-    low = jnp.floor(x)
-    return low.astype(jnp.int32), low
-
-
-PRIMES = np.array([73856093, 19349663, 83492791], np.uint32)
-"""Factors of the three integers of a cell."""
-
-
 def random_cell(x, y, z, seed, whole=whole):
     """Random number in [0, 1) of the unit cell around a point; `seed` is uint32, `whole` rounds down to int32."""
-    return random_of(*(whole(value) for value in (x, y, z)), seed)
-
-
-def random_of(a, b, c, seed):
-    """Random number in [0, 1) of three integers."""
-    a, b, c = (value.astype(jnp.uint32) * prime for value, prime in zip((a, b, c), PRIMES, strict=True))
-    return _mixed(a ^ b ^ c ^ seed)
-
-
-def _mixed(mixed):
-    """Number in [0, 1) of a hash: its bits become the mantissa of a number in [1, 2), for conversions are slow."""
+    a, b, c = (whole(value).astype(jnp.uint32) for value in (x, y, z))
+    mixed = (a * np.uint32(73856093)) ^ (b * np.uint32(19349663)) ^ (c * np.uint32(83492791)) ^ seed
     mixed = (mixed ^ (mixed >> 15)) * np.uint32(0x9E3779B1)
     mixed = (mixed ^ (mixed >> 13)) * np.uint32(0x85EBCA6B)
-    return jax.lax.bitcast_convert_type(mixed >> 9 | np.uint32(0x3F800000), jnp.float32) - 1.0
+    return (mixed >> 8).astype(jnp.int32).astype(jnp.float32) * (1.0 / (1 << 24))
