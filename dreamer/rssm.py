@@ -107,12 +107,6 @@ def posterior_probs(config: DreamerConfig, params: Params, deter: jax.Array, tok
     return dist.unimix_probs(to_logits(config, nets.linear(params["post_logit"], hidden)), config.unimix)
 
 
-def surprise(config: DreamerConfig, params: Params, deter: jax.Array, tokens: jax.Array) -> jax.Array:
-    """(B,) how much images change what was expected of them: KL(posterior || prior) [nat], from deter and tokens."""
-    posterior = posterior_probs(config, params, deter, tokens)
-    return dist.categorical_kl(posterior, prior_probs(config, params, deter))
-
-
 def observe_step(
     config: DreamerConfig,
     params: Params,
