@@ -62,9 +62,9 @@ CLAIMS = (
         "undeclared",
         "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
         "it. 1x is the "
-        'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns 2x and 4x are '
-        "of the present decision, on 3 and 10 logs, and 6 and 4 beyond the catalogue. The others are of the decision "
-        "before it.",
+        'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns 2x and 4x '
+        "are of the present decision, on 3 and 10 logs, and 6 and 4 beyond the catalogue. The others are of the "
+        "decision before it.",
         ("figure", "2x", "4x", "2x, twice the noise", "4x, twice the noise", "4x, heavy scooter"),
         tuple(
             (
