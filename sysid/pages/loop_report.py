@@ -38,6 +38,7 @@
     operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
                       of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
                       the share of simulated days on which it would be noticed, at factors on its size
+    log_doubts        what is wrong with the log itself, in sentences
     contradicted      what speaks against an effect that would else have been named, in sentences
     pairs             of the scan: the pairs of effects that explain most together
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
@@ -83,6 +84,7 @@ from sysid.follow_up.trust import (
     warnings,
 )
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
+from sysid.logs.coverage import doubts
 from sysid.logs.metrics import METRICS, own_floor
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
@@ -130,9 +132,11 @@ def make_report(result: Result) -> dict[str, Any]:
              if result.reference.known else "what the model family lacks")
     nulls = result.null_refits
     noise = {} if result.noise is None else result.noise.report()
+    base = base_table(result)
+    same = found.verdict == "none" and not shifts(base) and not (result.floor and result.floor.named)
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
-        "noise": noise, "noise_sentence": said(noise, found.verdict == "none") or None,
+        "noise": noise, "noise_sentence": said(noise, same) or None,
         "warnings": warnings(result),
         "advice": advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
         "remark": result.reference.remark,
@@ -147,7 +151,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "alone": alone(result, trials, before), "change": change(rows),
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
-        "contradicted": contradicted(result), "pairs": pairs_of(result),
+        "log_doubts": doubts(result.log), "contradicted": contradicted(result), "pairs": pairs_of(result),
         "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
                     "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
                     "excess_before": found.excess[0],
@@ -164,7 +168,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
         "floor": None if result.floor is None else {**result.floor.report(), "sentence": result.floor.said()},
-        "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
+        "next_manoeuvre": next_manoeuvre(result), "base": base, "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
 
@@ -409,7 +413,7 @@ def shifts(rows: list[dict[str, Any]], least: float = FAR) -> list[str]:
 
 def summary(report: dict[str, Any], width: int = 100) -> str:
     """What a person reads first, in lines of at most `width` characters."""
-    lines = [title(report), *lead(report), *report["advice"]]
+    lines = [title(report), *lead(report), *report["log_doubts"], *report["advice"]]
     if report["noise_sentence"] is not None:
         lines.append(f"noise: {report['noise_sentence']}")
     lines += ["", f"verdict: {report['verdict']} - {report['reason']}",

@@ -64,6 +64,7 @@ def test_bins_that_a_break_of_the_pose_touches_are_not_measured():
 def test_windows_without_replicates_are_put_into_eighths_and_replicates_are_not():
     windows = tuple(window(f"run/{i}", speed=1.0 + 0.1 * i) for i in range(16))
     assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=windows))] == [2] * 8
+    assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=windows[:5]))] == [1] * 5
     assert stands_alone(windows, known=False) and not stands_alone(windows, known=True)
     again = tuple(window(f"run/{i}") for i in range(16))
     assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=again))] == [16]
