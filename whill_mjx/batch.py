@@ -27,6 +27,10 @@ from whill_mjx.io.fields import BATCH, check_fields
 from whill_mjx.vehicle.types import TimeStep, VehicleParams
 from whill_mjx.world.randomize import Variation, randomize_params, vary_params
 
+FEW = 16
+"""Episodes that are begun at once on a processor, where a world costs more than a control period. An accelerator begins
+one for every instance, which takes it no longer."""
+
 
 @struct.dataclass
 class BatchState:
@@ -123,7 +127,8 @@ class BatchEnv:
         return state, time_step(obs, outcome, jnp.ones(keys.shape[:1], bool))
 
     def _step(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, TimeStep]:
-        state, outcome, first = jax.vmap(self._advance)(state, actions)
+        few = jax.default_backend() == "cpu" and actions.shape[0] > FEW
+        state, outcome, first = (self._advance_few if few else jax.vmap(self._advance))(state, actions)
         state, obs = self._sense(state)  # once, after the choice between step and reset
         return state, time_step(obs, outcome, first)
 
@@ -150,11 +155,34 @@ class BatchEnv:
     def _advance(self, state: BatchState, action: jax.Array) -> tuple[BatchState, Outcome, jax.Array]:
         ended = state.env.done
         after, outcome = step_state(self.env, state.params, state.env, action)
-        begun = self._begin(*(self._again(state) if self.second_tries else (state.env.key,)))
         chosen, outcome = jax.tree.map(
-            lambda new, old: jnp.where(ended, new, old), begun, (dataclasses.replace(state, env=after), outcome)
-        )
+            lambda new, old: jnp.where(ended, new, old),
+            self._anew(state), (dataclasses.replace(state, env=after), outcome),
+        )  # fmt: skip
         return chosen, outcome, ended
+
+    def _anew(self, state: BatchState) -> tuple[BatchState, Outcome]:
+        return self._begin(*(self._again(state) if self.second_tries else (state.env.key,)))
+
+    def _advance_few(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, Outcome, jax.Array]:
+        """The same for all instances; worlds are drawn for those alone that have ended, `FEW` at a time."""
+        ended, count = state.env.done, actions.shape[0]
+        after, outcome = jax.vmap(lambda one, action: step_state(self.env, one.params, one.env, action))(state, actions)
+        order = jnp.pad(jnp.argsort(~ended, stable=True), (0, FEW))
+        place = jnp.cumsum(ended) - 1  # of an instance that has ended, among these
+
+        def some(number: jax.Array, old: tuple[BatchState, Outcome]) -> tuple[BatchState, Outcome]:
+            chosen = jax.lax.dynamic_slice_in_dim(order, number * FEW, FEW)
+            begun = jax.vmap(self._anew)(jax.tree.map(lambda leaf: leaf[chosen], state))
+            here, own = ended & (place // FEW == number), place % FEW
+
+            def pick(new: jax.Array, old: jax.Array) -> jax.Array:
+                return jnp.where(here.reshape(count, *[1] * (old.ndim - 1)), new[own], old)
+
+            return jax.tree.map(pick, begun, old)
+
+        first = (dataclasses.replace(state, env=after), outcome)
+        return (*jax.lax.fori_loop(0, -(-ended.sum() // FEW), some, first), ended)
 
     def _split(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """The function with each device computing its own instances, by the program of a single device.
