@@ -70,7 +70,7 @@ class ChairSimulator:
 
         def scan(state: Any) -> Any:
             x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
-            return distances(x, y, yaw + angles, state.scene.boxes, SCAN_RANGE, SCAN_HEIGHT, SCAN_HEIGHT)
+            return distances(x, y, yaw + angles, state.scene.boxes, SCAN_RANGE, (SCAN_HEIGHT, SCAN_HEIGHT))
 
         self._scan = jax.jit(scan)
         self._occupied = jax.jit(lambda scene, x, y: _touched(scene, x, y))
