@@ -298,12 +298,12 @@ def searches(settings: Benchmark) -> None:
     problem = make_problem(log, FitConfig())
     judge = Judge(problem, log)
     compile_once(settings.work / "compiled", log.name, lambda: fit_searches.compile_replay(problem.objective))
+    effort = fit_searches.Effort(settings.tpe_trials, settings.iterations, settings.search_starts)
     labels = [f"{method}_{seed:02d}" for seed in range(settings.search_seeds) for method in settings.methods]
 
     def job(label: str) -> dict[str, Any]:
         method, _, seed = label.partition("_")
-        return fit_searches.curve_job(problem, judge, log.spec.track, method, int(seed), settings.tpe_trials,
-                                      settings.iterations, settings.search_starts)
+        return fit_searches.curve_job(problem, judge, method, int(seed), effort)
 
     run_jobs(folder / "jobs", labels_of(settings.part, labels), job)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid.errors.space import Space
-from sysid.intervals.design import Criterion, Plan
+from sysid.intervals.design import Criterion, Plan, Proposal
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
 from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, table
@@ -19,10 +19,9 @@ from whill_mjx.logs.dataset import write_text
 SHOWN = 12  # candidates listed
 
 
-def text(
-    chosen: Sequence[Plan], plans: Sequence[Plan], space: Space, before: np.ndarray, criterion: Criterion
-) -> str:
+def text(found: Proposal, criterion: Criterion) -> str:
     """What was chosen, why, and what it changes."""
+    chosen, plans, space, before = found.chosen, found.plans, found.space, found.before
     lines = []
     for number, plan in enumerate(chosen, start=1):
         x, y, yaw = plan.start
@@ -40,12 +39,12 @@ def text(
     return "\n".join(lines)
 
 
-def meaning(chosen: Sequence[Plan], space: Space, before: np.ndarray) -> str:
+def meaning(found: Proposal) -> str:
     """One sentence: what to drive, and what becomes of the parameter that is known worst."""
-    index = int(np.argmax(before))
-    drives = " and then ".join(plan.candidate.name.replace("_", " ") for plan in chosen)
-    return (f"Drive {drives} next: the uncertainty of {space.names[index]}, the largest, shrinks from "
-            f"{before[index]:.1%} to {chosen[-1].deviation[index]:.1%} of its range.")
+    index = int(np.argmax(found.before))
+    drives = " and then ".join(plan.candidate.name.replace("_", " ") for plan in found.chosen)
+    return (f"Drive {drives} next: the uncertainty of {found.space.names[index]}, the largest, shrinks from "
+            f"{found.before[index]:.1%} to {found.chosen[-1].deviation[index]:.1%} of its range.")
 
 
 def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
@@ -54,11 +53,9 @@ def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
     return [name for name, deviation in zip(space.names, best, strict=True) if deviation > UNIDENTIFIABLE * PRIOR_SD]
 
 
-def write_page(
-    path: Path, chosen: Sequence[Plan], plans: Sequence[Plan], space: Space, before: np.ndarray, limits: Limits,
-    config: Any,
-) -> Path:
+def write_page(path: Path, found: Proposal, limits: Limits, config: Any) -> Path:
     """Write the page, whole or not at all."""
+    chosen, plans, space, before = found.chosen, found.plans, found.space, found.before
     sections = []
     for plan in chosen:
         command = plan.candidate.command
@@ -85,7 +82,7 @@ def write_page(
     page = html_page(f"Next manoeuvre for {config.vehicle if '/' not in config.vehicle else Path(config.vehicle).name}",
                      sections, f"{limits.room[0]:g} x {limits.room[1]:g} m, {limits.v_min:g} to {limits.v_max:g} m/s, "
                      f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}", kind="Next drive",
-                     lead=meaning(chosen, space, before))
+                     lead=meaning(found))
     write_text(path, page)
     return path
 

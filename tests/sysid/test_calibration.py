@@ -29,7 +29,7 @@ from sysid.replay.on_host import HostReplay
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import drive_entries
-from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
+from sysid.replay.rollout import Commanded, Replay, make_batch, path_of, vehicle_plant
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FitConfig
@@ -410,7 +410,7 @@ def test_a_start_is_that_of_the_tracked_point_also_where_the_room_matters(small_
     turned = set_values(params, ["pose_mount.x", "pose_mount.yaw"], jnp.array([0.1, 0.5]))
     start = jnp.array([1.0, 2.0, 0.3, 0.0, 0.0])
     command = jnp.zeros((30, 2, 2)).at[..., 0].set(0.2)
-    path = jax.jit(lambda command: path_of(plant, turned, command, start))(command)
+    path = jax.jit(lambda command: path_of(plant, turned, Commanded(command, start)))(command)
     np.testing.assert_allclose(path[0, :3], start[:3], atol=1e-4)
     moved = np.asarray(path[-1, :2] - path[0, :2])
     np.testing.assert_allclose(np.arctan2(moved[1], moved[0]), 0.3 - 0.5, atol=1e-3)
