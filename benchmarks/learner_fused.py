@@ -382,7 +382,7 @@ def _timed(config: DreamerConfig, layout: Layout | None, arguments: tuple[Any, .
     params, start, *rest = arguments
 
     def observe(params: Params, start: Latent, *rest: jax.Array) -> Latent:
-        return rssm.observe(config, params, start, *rest)[0]
+        return rssm.observe(config, params, start, rssm.Sequences(*rest))[0]
 
     def many(params: Params, start: Latent, *rest: jax.Array) -> Latent:
         def one(_: jax.Array, start: Latent) -> Latent:

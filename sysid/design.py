@@ -71,13 +71,13 @@ def main(config: DesignConfig) -> list[Path]:
         for name in config.parameters:
             check_known("--parameters", name, describe(subject.params))
     spec = subject.spec
-    limits = Limits(
-        max(spec.v_min, -1.0) if config.v_min is None else config.v_min,
-        min(spec.v_max, 1.0) if config.v_max is None else config.v_max,
-        min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
-        float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
-        config.seconds)
     with refusing():
+        limits = Limits(
+            max(spec.v_min, -1.0) if config.v_min is None else config.v_min,
+            min(spec.v_max, 1.0) if config.v_max is None else config.v_max,
+            min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
+            float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
+            config.seconds)
         found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
                         names=config.parameters or None)
     paths = []

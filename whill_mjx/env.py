@@ -155,8 +155,6 @@ def make_env(
     task = make_task(task) if isinstance(task, str) else task
     if not isinstance(task, Task):
         raise ValueError(f"task is {task!r}; give a Task such as Corridor(), or the name of one.")
-    if observations is not None and not len(observations):
-        raise ValueError("observations are empty; name a sensor at least, or leave them out for those of the task.")
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
     check_task(task)

@@ -516,6 +516,9 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     """
     form = detect_format(path) if form == "auto" else form
     if form == "dataset":
+        if held_out and not train:
+            raise ValueError(f"{path}: its dataset.toml says which trials are held out. Give --train beside --held-out "
+                             "to choose both here, or leave --held-out out.")
         log: Log = with_own_timeout(_without_held(load_log(path)))
         return in_windows(without_standing(split(log, train, held_out) if train else log, str(path)))
     if not train:

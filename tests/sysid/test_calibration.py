@@ -18,7 +18,7 @@ from sysid.errors.space import make_space
 from sysid.intervals.uncertainty import Estimate, estimate
 from sysid.logs.log import load_log, make_trial
 from sysid.logs.records import Log, OdometryStream, PoseStream
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.reference import ASSUMED_SPREAD, assumed_spread
 from sysid.pages.calibration import UNKNOWN as NOT_TOLD
 from sysid.pages.calibration import calibration_notes
@@ -102,8 +102,9 @@ def planted(tmp_path_factory) -> Log:
     wrong = {"wheel_radius_difference.common": 0.03, "track_width.error": -0.05, "odometry_scale.linear": 0.98,
              "odometry_scale.angular": 0.97}
     params = set_values(params, list(wrong), jnp.array(list(wrong.values())))
-    folder = write_dataset(tmp_path_factory.mktemp("planted") / "log", spec, params, replicates=1, seed=2,
-                           scenario=Scenario(v=0.4, omega=1.2, length=3.0), manoeuvres=("turn", "s_curve"),
+    folder = write_dataset(tmp_path_factory.mktemp("planted") / "log", spec, params,
+                           Schedule(replicates=1, seed=2, scenario=Scenario(v=0.4, omega=1.2, length=3.0),
+                                    manoeuvres=("turn", "s_curve")),
                            plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)))
     log, trials = load_log(folder), []
     for trial in log.trials:

@@ -220,6 +220,8 @@ def with_settings(learner: Any, settings: Sequence[str]) -> Any:
     changes = {}
     for text in settings:
         name, _, value = text.partition("=")
+        if name in changes:
+            raise ValueError(f"{text!r}: {name} is given twice. Leave one out.")
         if name not in known:
             raise ValueError(f"{text!r} changes no setting of the learner; these are: {', '.join(sorted(known))}.")
         try:
