@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from sysid.replay.model_files import steps_mjx
 from sysid.search.result import Progress
 from whill_mjx.io import command_line
 from whill_mjx.io.heartbeat import Heartbeat
@@ -16,10 +15,7 @@ _heartbeats: list[Heartbeat] = []
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
-    """`whill_mjx.io.command_line.run` with signs of life.
-
-    XLA shares results unless the command steps a user's robot (`--model`), on which it may abort then.
-    """
+    """`whill_mjx.io.command_line.run` with signs of life."""
 
     def alive(chosen: Any) -> None:
         with Heartbeat() as heartbeat:  # progress bars tick while something long is computed
@@ -29,8 +25,7 @@ def run(options: type, main: Callable[[Any], Any], description: str | None, **mo
             finally:
                 _heartbeats.remove(heartbeat)
 
-    command_line.run(options, alive, description, **more,
-                     shares=lambda chosen: not steps_mjx(getattr(chosen, "model", None)))
+    command_line.run(options, alive, description, **more)
 
 
 def stage(text: str) -> None:

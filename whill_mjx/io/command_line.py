@@ -142,25 +142,25 @@ def check_options(options: Any, prefix: str = "") -> None:
 
 def run(
     options: type, main: Callable[[Any], Any], description: str | None, *, stopped: str = STOPPED,
-    positional: bool = True, args: list[str] | None = None, shares: Callable[[Any], bool] = lambda chosen: True,
+    positional: bool = True, args: list[str] | None = None,
 ) -> None:  # fmt: skip
     """Read `options` from the command line, check them and call `main`; what goes wrong ends with one line.
 
     What XLA compiles is kept for later runs (`whill_mjx.io.compiled`).
 
     Args:
-        options: dataclass of the options; numbers may be Annotated with a `Range`.
+        options: dataclass of the options; numbers may be Annotated with a `Range`. Its `shares_results`, if it has one,
+            says whether the command may use `share_results`; JAX must not have started before.
         main: gets the options.
         description: the command's help.
         stopped: the line after a signal, which says how to go on.
         positional: options without a default are given without their names.
         args: words instead of those of the command line.
-        shares: whether a command with these options may use `share_results`; JAX must not have started before.
     """
     with guarded(stopped):
         chosen = _parsed(options, description, positional, args)
         check_options(chosen)
-        (share_results if shares(chosen) else keep_results_apart)()
+        (share_results if getattr(chosen, "shares_results", True) else keep_results_apart)()
         keep_compiled()
         main(chosen)
 
