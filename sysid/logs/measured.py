@@ -503,7 +503,11 @@ def _selected(log: Log, selection: str) -> list[str]:
     except ValueError:
         raise ValueError(f"selection {selection!r}: {share!r} must be FROM-TO, shares of the run, e.g. 0-0.667."
                          ) from None
-    return [name for i, name in enumerate(names) if low <= i / len(names) < high]
+    chosen = [name for i, name in enumerate(names) if low <= i / len(names) < high]
+    if not chosen:
+        raise ValueError(f"selection {selection!r} holds none of {len(names)} windows. Give FROM-TO, FROM below TO, as "
+                         "shares of the run from 0 to 1.")
+    return chosen
 
 
 def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), held_out: tuple[str, ...] = (),
@@ -529,9 +533,16 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     if form == "drive_norlab":
         return without_lost(split(load_drive(path, tuple(dict.fromkeys(keys)), chained), train, held_out))
     if form == "mrclam":
-        robots = tuple(dict.fromkeys(int(key.removeprefix("robot")) for key in keys))
+        robots = tuple(dict.fromkeys(_robot(key) for key in keys))
         return split(load_mrclam(path, robots), train, held_out)
     raise ValueError(f"unknown format {form!r} (known: auto, dataset, drive_norlab, mrclam).")
+
+
+def _robot(key: str) -> int:
+    """Number of an MRCLAM robot."""
+    if key.removeprefix("robot") not in ("1", "2", "3", "4", "5"):
+        raise ValueError(f"selection {key!r}: the robots are robot1 to robot5. Correct it.")
+    return int(key.removeprefix("robot"))
 
 
 def _without_held(log: Log) -> Log:

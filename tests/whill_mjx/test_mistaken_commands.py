@@ -103,6 +103,8 @@ def mistaken(command, words, capsys):
     ("evaluate", "planner --sweep start_x=1e300", "start_x is 1e+300"),
     ("evaluate", "planner --task task.py", "--task task.py: a task in a file is named too. Give task.py:CLASS."),
     ("evaluate", "planner --sweep yaw_scrub.nope=1", "no parameter 'nope'"),
+    ("evaluate", "planner --sweep body.mass=50,-5", "body.mass is -5"),
+    ("evaluate", "planner --sweep body.mass=0x,1x", "factor is 0"),
     ("evaluate", "planner --sweep vehicle=whill_cr,nope", "unknown vehicle 'nope'"),
     ("evaluate", "planner --baselines nope", "'nope' is not NAME=VALUE"),
     ("evaluate", "planner --vehicle nope", "unknown vehicle 'nope'"),

@@ -392,6 +392,10 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
             raise ValueError(f"vary 'fit': {vehicle} has no intervals. Give a file that sysid.fit wrote, or ranges "
                              "such as body.mass=0.9x:1.1x.")
         found += [Variation(name, low, high) for name, (low, high) in intervals.items()]
+    names = [text.partition("=")[0] for text in texts]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"vary {' '.join(texts)}: {name} is given twice. Leave one out.")
     return tuple(found)
 
 
