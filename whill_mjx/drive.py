@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, listen, refusing, run, starts
+from whill_mjx.io.command_line import SEED, OptionError, Range, check_once, listen, refusing, run, starts
 
 if starts(__name__):
     listen()
@@ -245,6 +245,7 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
         raise OptionError("--manoeuvre: none is given. Name one, or leave the option out for figure_eight.")
     if len(set(names)) != len(names):
         raise ValueError(f"--manoeuvre {' '.join(names)}: one is given twice. Repeat a drive with --replicates.")
+    check_once("--effects", [text.partition(":")[0] for text in options.effects])
     if options.replicates < 1:
         raise ValueError(f"--replicates {options.replicates}: must be at least 1. Leave it out for a single drive.")
     absent = sorted(set(options.held_out) - set(names))

@@ -109,6 +109,8 @@ def _parse_axis(text: str) -> Axis:
         raise ValueError(f"{text!r}: {error}; write NAME=a,b,c or NAME=low:high:count.") from error
     if not numbers.size:
         raise ValueError(f"{text!r}: has no value; write NAME=a,b,c or NAME=low:high:count.")
+    if len(np.unique(numbers)) < len(numbers):
+        raise ValueError(f"{text!r}: a value is there twice. Leave one out.")
     if not np.isfinite(numbers).all():
         raise ValueError(f"{text!r}: values must be finite.")
     ends = float(numbers.min()), float(numbers.max())
