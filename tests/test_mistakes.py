@@ -123,8 +123,6 @@ def mistakes(tmp_path_factory):
     ("fit", "data --model other.py --close-loop", "--close-loop asks what the simulator's vehicle lacks"),
     ("fit", "data --train nope", "selection 'nope' matches no trial"),
     ("fit", "data --format mrclam", "data"),
-    ("fit", "data --format mrclam --train robotX", "the robots are robot1 to robot5"),
-    ("fit", "data --train circle_1:0.9-0.1", "selection 'circle_1:0.9-0.1' holds none of 1 windows"),
     ("fit", "data --storage nope --method tpe", "storage 'nope' is neither"),
     ("fit", "data --storage journal:a.log", "--storage journal:a.log: --method features has no global search"),
     ("fit", "data --close-loop --reference nowhere", "nowhere"),

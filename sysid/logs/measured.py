@@ -503,11 +503,7 @@ def _selected(log: Log, selection: str) -> list[str]:
     except ValueError:
         raise ValueError(f"selection {selection!r}: {share!r} must be FROM-TO, shares of the run, e.g. 0-0.667."
                          ) from None
-    chosen = [name for i, name in enumerate(names) if low <= i / len(names) < high]
-    if not chosen:
-        raise ValueError(f"selection {selection!r} holds none of {len(names)} windows. Give FROM-TO, FROM below TO, as "
-                         "shares of the run from 0 to 1.")
-    return chosen
+    return [name for i, name in enumerate(names) if low <= i / len(names) < high]
 
 
 def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), held_out: tuple[str, ...] = (),
@@ -519,10 +515,10 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     no command comes does so in replays too (`sysid.logs.command_timeout`). A note says each.
     """
     form = detect_format(path) if form == "auto" else form
+    if form == "dataset" and held_out and not train:
+        raise ValueError(f"{path}: its dataset.toml says which trials are held out. Give --train beside --held-out "
+                         "to choose both here, or leave --held-out out.")
     if form == "dataset":
-        if held_out and not train:
-            raise ValueError(f"{path}: its dataset.toml says which trials are held out. Give --train beside --held-out "
-                             "to choose both here, or leave --held-out out.")
         log: Log = with_own_timeout(_without_held(load_log(path)))
         return in_windows(without_standing(split(log, train, held_out) if train else log, str(path)))
     if not train:
@@ -533,16 +529,9 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     if form == "drive_norlab":
         return without_lost(split(load_drive(path, tuple(dict.fromkeys(keys)), chained), train, held_out))
     if form == "mrclam":
-        robots = tuple(dict.fromkeys(_robot(key) for key in keys))
+        robots = tuple(dict.fromkeys(int(key.removeprefix("robot")) for key in keys))
         return split(load_mrclam(path, robots), train, held_out)
     raise ValueError(f"unknown format {form!r} (known: auto, dataset, drive_norlab, mrclam).")
-
-
-def _robot(key: str) -> int:
-    """Number of an MRCLAM robot."""
-    if key.removeprefix("robot") not in ("1", "2", "3", "4", "5"):
-        raise ValueError(f"selection {key!r}: the robots are robot1 to robot5. Correct it.")
-    return int(key.removeprefix("robot"))
 
 
 def _without_held(log: Log) -> Log:

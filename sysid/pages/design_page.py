@@ -39,12 +39,12 @@ def text(found: Proposal, criterion: Criterion) -> str:
     return "\n".join(lines)
 
 
-def meaning(found: Proposal) -> str:
+def meaning(chosen: Sequence[Plan], space: Space, before: np.ndarray) -> str:
     """One sentence: what to drive, and what becomes of the parameter that is known worst."""
-    index = int(np.argmax(found.before))
-    drives = " and then ".join(plan.candidate.name.replace("_", " ") for plan in found.chosen)
-    return (f"Drive {drives} next: the uncertainty of {found.space.names[index]}, the largest, shrinks from "
-            f"{found.before[index]:.1%} to {found.chosen[-1].deviation[index]:.1%} of its range.")
+    index = int(np.argmax(before))
+    drives = " and then ".join(plan.candidate.name.replace("_", " ") for plan in chosen)
+    return (f"Drive {drives} next: the uncertainty of {space.names[index]}, the largest, shrinks from "
+            f"{before[index]:.1%} to {chosen[-1].deviation[index]:.1%} of its range.")
 
 
 def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
@@ -83,7 +83,7 @@ def write_page(path: Path, found: Proposal, limits: Limits, config: Any) -> Path
     page = html_page(f"Next manoeuvre for {config.vehicle if '/' not in config.vehicle else Path(config.vehicle).name}",
                      sections, f"{limits.room[0]:g} x {limits.room[1]:g} m, {limits.v_min:g} to {limits.v_max:g} m/s, "
                      f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}", kind="Next drive",
-                     lead=meaning(found))
+                     lead=meaning(chosen, space, before))
     write_text(path, page)
     return path
 
