@@ -55,19 +55,20 @@ class Layout:
     """One program does all tiles, which needs no waiting: for interpretation on a CPU."""
 
 
-def fused_scan(layout: Layout) -> Callable[..., tuple[Tree, Tree]]:
-    """`recurrence.scan_products` for the step of `rssm.observe`, by one kernel; not differentiable.
+def _check_widths(config: DreamerConfig) -> None:
+    """Raise ValueError for a width that is not a power of two, which Triton needs."""
+    for name in ("deter", "hidden", "stoch", "classes", "blocks", "batch_size"):
+        value = getattr(config, name)
+        if value & (value - 1):
+            raise ValueError(f"fused posterior: {name} is {value}; Triton needs a power of two.")
 
-    The function raises:
-        ValueError: a width is not a power of two, which Triton needs.
-    """
+
+def fused_scan(layout: Layout) -> Callable[..., tuple[Tree, Tree]]:
+    """`recurrence.scan_products` for the step of `rssm.observe`, by one kernel; not differentiable."""
     def scan(step: Step, unroll: int, weights: dict[str, jax.Array], carry: Tree, terms: dict[str, jax.Array],
              inputs: Tree) -> tuple[Tree, Tree]:
         config: DreamerConfig = step.args[0]  # type: ignore[attr-defined]
-        for name in ("deter", "hidden", "stoch", "classes", "blocks", "batch_size"):
-            value = getattr(config, name)
-            if value & (value - 1):
-                raise ValueError(f"fused posterior: {name} is {value}; Triton needs a power of two.")
+        _check_widths(config)
         deter, stoch, product = carry
         (count, batch), width, hidden = inputs["is_first"].shape[:2], config.deter, config.hidden
         latent = stoch.shape[-1]
