@@ -290,25 +290,32 @@ def kill_again_and_again(name: str, words: list[str], kills: int, seed: int, kep
 
 
 def killed_figures(kept: Kept) -> Figures:
-    """Sums over all kills that ended in bits, of commands that were also left alone."""
+    """Sums over all kills, and over the bits of those runs that came to their end beside one that was left alone.
+
+    What a kill cost is known at once; a run that was not taken to its end has no bits to compare.
+    """
     alone = {name: found for name in COMMANDS if (found := kept.read(f"alone_{name}", any_commit=True))}
-    runs: list[dict[str, Any]] = []
-    for name, left in alone.items():
-        for one in kept.all(f"kills_{name}_"):
-            one["wrong_ends"] = len(one["wrong_ends"])
-            if one["bits"] and one["words"] == left["words"] and one["commit"] == left["commit"]:
-                runs.append({**one, "name": name, "different": sum(bits != left["bits"] for bits in one["bits"])})
-    if not runs:
+    runs = {name: found for name in COMMANDS if (found := kept.all(f"kills_{name}_"))}
+    every = [one for found in runs.values() for one in found]
+    if not every:
         return {}
-    about = {"kills": {name: sum(one["kills"] for one in runs if one["name"] == name) for name in alone},
-             "ended": sum(len(one["bits"]) for one in runs), "commits": sorted({one["commit"] for one in runs}),
+    compared = {name: [bits == alone[name]["bits"] for one in found for bits in one["bits"]
+                       if (one["words"], one["commit"]) == (alone[name]["words"], alone[name]["commit"])]
+                for name, found in runs.items() if name in alone}
+    about = {"kills": {name: sum(one["kills"] for one in found) for name, found in runs.items()},
+             "ended": {name: len(same) for name, same in compared.items()},
+             "commits": sorted({one["commit"] for one in every}),
              "seconds": {name: found["seconds"] for name, found in alone.items()}}  # fmt: skip
-    device = next(iter(alone.values()))["device"]
-    counts = {f"kills_{what}": {**figure([float(sum(one[what] for one in runs))], "count", device), **about}
-              for what in ("lost", "different", "half_written", "wrong_ends")}
+    counts = {"lost": sum(one["lost"] for one in every), "half_written": sum(one["half_written"] for one in every),
+              "wrong_ends": sum(len(one["wrong_ends"]) for one in every),
+              "different": sum(not same for found in compared.values() for same in found)}
+    device = next((one["device"] for one in (*alone.values(), *every) if "device" in one), device_name())
+    figures = {f"kills_{what}": {**figure([float(count)], "count", device), **about} for what, count in counts.items()}
+    if not alone:
+        return figures
     unsaved = [found["unsaved_s"] for found in alone.values()]
     longest = figure(unsaved, "s of processor time that a run computed without saving, at most", device)
-    return {**counts, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
+    return {**figures, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
 
 
 def interrupted(name: str, words: list[str], count: int, seed: int, kept: Kept) -> None:
