@@ -303,7 +303,7 @@ def killed_figures(kept: Kept) -> Figures:
                        if (one["words"], one["commit"]) == (alone[name]["words"], alone[name]["commit"])]
                 for name, found in runs.items() if name in alone}
     about = {"kills": {name: sum(one["kills"] for one in found) for name, found in runs.items()},
-             "ended": {name: len(same) for name, same in compared.items()},
+             "ended": sum(len(same) for same in compared.values()),
              "commits": sorted({one["commit"] for one in every}),
              "seconds": {name: found["seconds"] for name, found in alone.items()}}  # fmt: skip
     counts = {"lost": sum(one["lost"] for one in every), "half_written": sum(one["half_written"] for one in every),
