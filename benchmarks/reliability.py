@@ -302,7 +302,8 @@ def killed_figures(kept: Kept) -> Figures:
     compared = {name: [bits == alone[name]["bits"] for one in found for bits in one["bits"]
                        if (one["words"], one["commit"]) == (alone[name]["words"], alone[name]["commit"])]
                 for name, found in runs.items() if name in alone}
-    about = {"kills": {name: sum(one["kills"] for one in found) for name, found in runs.items()},
+    about = {"kills": sum(one["kills"] for one in every),
+             "kills_of": {name: sum(one["kills"] for one in found) for name, found in runs.items()},
              "ended": sum(len(same) for same in compared.values()),
              "commits": sorted({one["commit"] for one in every}),
              "seconds": {name: found["seconds"] for name, found in alone.items()}}  # fmt: skip
