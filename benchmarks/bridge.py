@@ -1,17 +1,19 @@
 """Latency and reaction times of the bridge: separate processes over real DDS on this machine.
 
     python -m benchmarks.bridge --seconds 60
+    python -m benchmarks.bridge --parts steady --seconds 720 --together     # each steady run on two cores of its own
 
 The policy is a stand-in of 10 million random parameters with the shape of a trained one (recurrent, 64x64 RGB), unless
---policy names another. A trained policy cannot be made to fail on purpose, so `stop_action_ms` always uses the
-stand-in. All times are of the system's one steady clock. Figures named `_realtime` are taken with both nodes under
-SCHED_FIFO, where that is permitted. Faults are injected by a plain ROS node (benchmarks.bridge_robot); a reaction is
-the time from the injection to the first zero that this node hears.
+--policy names another. A trained policy cannot be made to fail on purpose, so faults always use the stand-in. All times
+are of the system's one steady clock. Figures named `_realtime` are taken with both nodes under SCHED_FIFO, and left out
+where that is not permitted. Faults are those of benchmarks.bridge_faults; a reaction is the time from the injection to
+the first zero that the base hears.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -22,13 +24,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.bridge_robot import Robot, Switch, message_type
+from benchmarks.bridge_faults import FAULTS, Figures, fault_rows, measure_faults
 from bridge.options import Parser, in_range, whole
 from bridge.simulated import Frame
 from whill_mjx.io.command_line import guarded
@@ -77,7 +79,7 @@ class WhiteRobot(EndlessRobot):
 
 
 def export_stand_in(folder: Path) -> Path:
-    """Write a recurrent policy of random parameters; a white image makes its action NaN."""
+    """Write a recurrent policy of random parameters; a white image makes its action NaN, a pale one surprises it."""
     import jax
     import jax.numpy as jnp
 
@@ -99,30 +101,48 @@ def export_stand_in(folder: Path) -> Path:
         update = jax.nn.sigmoid(update - 1)
         deter = (update * jnp.tanh(jax.nn.sigmoid(reset) * candidate) + (1 - update) * blocks).reshape(-1)
         action = 0.5 + 0.4 * jnp.tanh(deter @ weights["out"])[:2]
-        return {"deter": deter}, jnp.where(x.mean() > 0.99, jnp.nan, action)
+        surprise = jnp.where((x.mean() > 0.7) & (x.mean() < 0.9), 100.0, 1.0)
+        return ({"deter": deter, "surprise": jnp.full_like(carry["surprise"], surprise)},
+                jnp.where(x.mean() > 0.99, jnp.nan, action))
 
-    contract = PolicyContract(action_low=(-0.5, -0.6), action_high=(1.0, 0.6), task="stand-in")
-    return export_policy(folder, step, {"deter": np.zeros(HIDDEN, np.float32)}, weights, contract,
-                         check_steps=1000)
+    contract = PolicyContract(action_low=(-0.5, -0.6), action_high=(1.0, 0.6), task="stand-in", novelty=(10.0, 50.0))
+    carry = {"deter": np.zeros(HIDDEN, np.float32), "surprise": np.zeros(1, np.float32)}
+    return export_policy(folder, step, carry, weights, contract, check_steps=1000)
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where two nodes run."""
+
+    domain: int
+    """ROS domain."""
+    cores: Sequence[int] = ()
+    """That they have for themselves; none takes all."""
+    realtime: bool = False
+    """Under SCHED_FIFO."""
 
 
 class Run:
     """One simulator and one policy node, and what they report."""
 
-    def __init__(self, folder: Path, policy: Path, robot: str, domain: int, *options: str, realtime: bool = False
-                 ) -> None:
-        self.results, self.drive_results = folder / "simulate.json", folder / "drive.json"
+    def __init__(self, folder: Path, policy: Path, robot: str, place: Place, *options: str) -> None:
+        domain = place.domain
+        self.results, self.drive_results = folder / f"simulate_{domain}.json", folder / f"drive_{domain}.json"
         for path in (self.results, self.drive_results):
             path.unlink(missing_ok=True)
+        self._cores = place.cores
         self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        scheduling = ("--realtime", "20") if realtime else ()
+        scheduling = ("--realtime", "20") if place.realtime else ()
         self.drive = self._start("bridge.drive", str(policy), "--results", str(self.drive_results), *scheduling)
         self.simulate = self._start("bridge.simulate", "--simulator", f"benchmarks.bridge:{robot}", "--results",
                                     str(self.results), *scheduling, *options)
 
     def _start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
-        return subprocess.Popen([sys.executable, "-m", module, *arguments], env=self._environment,
-                                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen([sys.executable, "-m", module, *arguments], env=self._environment,
+                                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        if self._cores:
+            os.sched_setaffinity(process.pid, self._cores)
+        return process
 
     def finish(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """End the processes, the policy node first, and return the results of simulator and policy node."""
@@ -154,6 +174,17 @@ def stops(drive: dict[str, Any]) -> int:
     return sum(count for name, count in drive["counts"].items() if name.startswith("stop: "))
 
 
+def may_run_in_real_time() -> bool:
+    """Return whether SCHED_FIFO is permitted here; say so where it is not."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        print("SCHED_FIFO is not permitted here: figures in real time are left out", flush=True)
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
 def processor_seconds(pid: int) -> float:
     """Return the processor time [s] that a process has taken."""
     with open(f"/proc/{pid}/stat") as file:
@@ -167,135 +198,40 @@ def memory_mb(pid: int) -> float:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-class Bridge:
-    """A policy node that drives a robot of plain ROS."""
-
-    def __init__(self, policy: Path, domain: int, *options: str) -> None:
-        self.robot = Robot(domain)
-        self.e_stop = self.robot.whole(shade=120)  # at white the stand-in fails
-        self.enable = Switch(self.robot, "enable", True)
-        self.collision = self.robot.publisher("std_msgs/Bool", "collision_sensor")
-        self.robot.joystick()
-        if SIMULATED[-1] in options:
-            self.robot.clock()
-        self.other: Any = None
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        self.process = subprocess.Popen([sys.executable, "-m", "bridge.drive", str(policy), *options], env=environment,
-                                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-    def collide(self, value: bool) -> None:
-        """Publish one value of the collision sensor."""
-        self.collision.publish(message_type("std_msgs/Bool")(data=value))
-
-    def join(self) -> None:
-        """Let another node publish on the command topic; it sends nothing."""
-        self.other = self.robot.publisher("geometry_msgs/Twist", "whill/controller/cmd_vel")
-
-    def leave(self) -> None:
-        """Take that publisher away."""
-        self.robot.node.destroy_publisher(self.other)
-
-    def guard(self) -> int:
-        """Return the process of its guard."""
-        with open(f"/proc/{self.process.pid}/task/{self.process.pid}/children") as file:
-            return int(file.read().split()[0])
-
-    def close(self) -> None:
-        """End it, and the robot."""
-        self.process.send_signal(signal.SIGCONT)
-        self.process.terminate()
-        self.process.wait(60)
-        self.robot.close()
+@contextlib.contextmanager
+def burners(count: int, cores: Sequence[int] = ()) -> Iterator[None]:
+    """Processes that take a core each, of these cores where some are named."""
+    running = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        for one in running:
+            if cores:
+                os.sched_setaffinity(one.pid, cores)
+        yield
+    finally:
+        for one in running:
+            one.kill()
+            one.wait()
 
 
-SIMULATED = ("--ros-args", "-p", "use_sim_time:=true")
-FAULTS: dict[str, tuple[tuple[str, ...], Any, Any]] = {
-    "e_stop": ((), lambda bridge: bridge.e_stop.turn(True), lambda bridge: bridge.e_stop.turn(False)),
-    "e_stop_silent": ((), lambda bridge: bridge.e_stop.timer.cancel(), lambda bridge: bridge.e_stop.timer.reset()),
-    "collision": ((), lambda bridge: bridge.collide(True), lambda bridge: bridge.collide(False)),
-    "enable": (("--enable", "require"), lambda bridge: bridge.enable.turn(False),
-               lambda bridge: bridge.enable.turn(True)),
-    "frozen_camera": ((), lambda bridge: setattr(bridge.robot, "frozen", True),
-                      lambda bridge: setattr(bridge.robot, "frozen", False)),
-    "late_stamps": ((), lambda bridge: setattr(bridge.robot, "clock_offset", -5.0),
-                    lambda bridge: setattr(bridge.robot, "clock_offset", 0.0)),
-    "wrong_encoding": ((), lambda bridge: setattr(bridge.robot, "encoding", "bayer_rggb8"),
-                       lambda bridge: setattr(bridge.robot, "encoding", "rgb8")),
-    "repeated_stamp": ((), lambda bridge: setattr(bridge.robot, "repeats_stamp", True),
-                       lambda bridge: setattr(bridge.robot, "repeats_stamp", False)),
-    "dark_camera": (("--blind", "stop"), lambda bridge: setattr(bridge.robot, "dark", True),
-                    lambda bridge: setattr(bridge.robot, "dark", False)),
-    "dead_man": (("--dead-man-button", "0"), lambda bridge: setattr(bridge.robot, "held", False),
-                 lambda bridge: setattr(bridge.robot, "held", True)),
-    "second_commander": ((), lambda bridge: bridge.join(), lambda bridge: bridge.leave()),
-    "clock_stops": (SIMULATED, lambda bridge: setattr(bridge.robot, "ticking", False),
-                    lambda bridge: setattr(bridge.robot, "ticking", True)),
-    "clock_jumps": (SIMULATED, lambda bridge: setattr(bridge.robot, "clock_offset", 90.0),
-                    lambda bridge: setattr(bridge.robot, "clock_offset", 0.0)),
-    "guard_killed": ((), lambda bridge: os.kill(bridge.guard(), signal.SIGKILL), lambda bridge: None),
-    "node_stopped": (("--signal-age", "5"), lambda bridge: bridge.process.send_signal(signal.SIGSTOP),
-                    lambda bridge: bridge.process.send_signal(signal.SIGCONT)),
-    "node_ends": ((), lambda bridge: bridge.process.terminate(), None),
-    "killed": ((), lambda bridge: bridge.process.kill(), None),
-    "killed_first": ((), lambda bridge: bridge.process.kill(), None),
-}
-"""Options, injection and its end by the name of a fault; without an end each repeat takes a new node."""
-
-
-def measure_faults(policy: Path, domain: int, repeats: int, names: Sequence[str]) -> Figures:
-    """Return the reaction times to the faults of these names."""
-    found: Figures = {}
-    for number, (name, (options, inject, end)) in enumerate((name, FAULTS[name]) for name in names):
-        reactions: list[float] = []
-        while len(reactions) < repeats:
-            bridge = Bridge(policy, domain + number, *options)
-            try:
-                reactions.extend(reaction_times(bridge, name, inject, end, repeats if end else 1, len(reactions)))
-            finally:
-                bridge.close()
-        title = "e_stop_ms" if name == "e_stop" else f"stop_{name}_ms"
-        found[title] = (reactions, "ms from the fault to the first zero")
-    return found
-
-
-def reaction_times(bridge: Bridge, name: str, inject: Any, end: Any, repeats: int, phase: int) -> list[float]:
-    """Return the times [ms] from a fault to the first zero, each at another phase of the control period."""
-    robot, found = bridge.robot, []
-    for i in range(repeats):
-        robot.wait_until(moving_after(time.monotonic()))
-        if name != "killed_first":
-            time.sleep(0.7 + 0.037 * (i + phase))
-            robot.wait_until(moving_after(time.monotonic()))  # a busy machine may have stopped it meanwhile
-        at = time.monotonic()
-        inject(bridge)
-        found.append(1e3 * robot.first_zero(at))
-        if end is None:
-            break
-        end(bridge)
-        with contextlib.suppress(AssertionError):  # resumed by itself
-            robot.wait_for_status(2.0, state="disarmed", holds="[]")
-            robot.arm()
-    return found
-
-
-def moving_after(since: float) -> Callable[[Robot], Any]:
-    """Return the condition that a motion is commanded after a time."""
-    return lambda robot: robot.moving(since)
-
-
-def fuzz(count: int) -> int:
-    """Return how many commands of a supervisor left the limits, of so many outputs of any bits."""
+def fuzz(count: int) -> tuple[int, int]:
+    """Return how many commands of a supervisor left its limits, and its slew limits, of so many outputs of any bits."""
     from bridge.safety import SafetyConfig, Supervisor
 
-    config = SafetyConfig((-0.5, -1.0), (1.0, 1.0))
-    supervisor, rng, now, wrong = Supervisor(config), np.random.default_rng(0), 0.0, 0
+    low, high, slew = np.array([-0.5, -1.0]), np.array([1.0, 1.0]), np.array([0.5, 1.0])
+    plain = SafetyConfig((-0.5, -1.0), (1.0, 1.0))
+    supervisors = [Supervisor(plain), Supervisor(dataclasses.replace(plain, slew=(0.5, 1.0)))]
+    rng, now, wrong, jumps, before = np.random.default_rng(0), 0.0, 0, 0, np.zeros(2)
     for number, bits in enumerate(rng.integers(0, 2**64, (count, 2), np.uint64)):
         now += 0.1
-        supervisor.frame(now, now, number)
-        command = supervisor.action(now, bits.view(np.float64))
-        wrong += not (-0.5 <= command.v <= 1.0 and -1.0 <= command.omega <= 1.0)
-        supervisor.arm()
-    return wrong
+        for supervisor in supervisors:
+            supervisor.frame(now, now, number)
+            command = supervisor.action(now, bits.view(np.float64))
+            sent = np.array([command.v, command.omega])
+            wrong += not (np.all(low <= sent) and np.all(sent <= high))
+            supervisor.arm()
+        jumps += bool(sent.any() and np.any(np.abs(sent - before) > 0.1 * slew + 1e-9))
+        before = sent
+    return wrong, jumps
 
 
 def policy_times(policy_path: Path, steps: int) -> np.ndarray:
@@ -325,53 +261,131 @@ def cold_start(policy_path: Path) -> float:
     return time.perf_counter() - start
 
 
-Figures = dict[str, tuple[list[float], str]]
-"""Repeats and unit of each figure by its name."""
+@dataclasses.dataclass(frozen=True)
+class Steady:
+    """An undisturbed drive of some kind."""
+
+    suffix: str
+    """Of its figures' names."""
+    options: tuple[str, ...] = ()
+    """Of the simulator."""
+    burners: int = 0
+    """Busy processes on the same cores."""
+
+    @property
+    def realtime(self) -> bool:
+        """Whether the nodes run under SCHED_FIFO."""
+        return self.suffix.endswith("_realtime")
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the computer has time for it."""
+        return not self.burners
 
 
-def measure_steady(policy: Path, folder: Path, domain: int, seconds: float) -> Figures:
-    """Return latency, pacing, delivery, spurious stops and memory of undisturbed drives."""
+START = 15.0
+"""Seconds after which nodes have found each other, and all that is loaded once is in memory."""
+LARGE = ("--image-size", "720", "1280")
+STEADY = {
+    "usual": Steady(""), "realtime": Steady("_realtime"),
+    "large": Steady("_720p", LARGE), "large_realtime": Steady("_720p_realtime", LARGE),
+    "busy": Steady("_busy", burners=2), "busy_realtime": Steady("_busy_realtime", burners=2),
+}
+
+
+class SteadyRun:
+    """One steady drive while it runs."""
+
+    def __init__(self, kind: Steady, folder: Path, policy: Path, domain: int, cores: Sequence[int]) -> None:
+        self.kind = kind
+        self._stack = contextlib.ExitStack()
+        self._stack.enter_context(burners(kind.burners, cores))
+        self._run = Run(folder, policy, "EndlessRobot", Place(domain, cores, kind.realtime), *kind.options)
+        self.memory: list[float] = []
+        self._taken = 0.0
+
+    def mark(self) -> None:
+        """Note memory and processor time now."""
+        self.memory.append(memory_mb(self._run.drive.pid))
+        self._taken = processor_seconds(self._run.drive.pid) - self._taken
+
+    def finish(self, seconds: float) -> tuple[Figures, int, int]:
+        """End it; return its figures, stops and missed ticks."""
+        with self._stack:
+            results, drive = self._run.finish()
+        delays, intervals = settled(results)
+        suffix, error = self.kind.suffix, np.abs(intervals - 100)
+        figures: Figures = {}
+        if self.kind.burners:
+            figures[f"interval_p99{suffix.removeprefix('_busy')}_ms"] = (
+                [float(np.percentile(error, 99))], f"ms off the period, {self.kind.burners} busy processes")
+        elif self.kind.options:
+            suffix = suffix.removeprefix("_720p")
+            figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms", histogram(delays))
+            end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
+            shown = sum(t < end - 0.01 for t in results["image_times"])
+            figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
+        else:
+            for name, share, more in (("p50", 50, (histogram(delays),)), ("p99", 99, ()), ("max", 100, ())):
+                figures[f"frame_to_command_{name}{suffix}_ms"] = (
+                    [float(np.percentile(delays, share))], f"ms, of {len(delays)} frames", *more)
+            figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(error, 99))], "ms")
+            figures[f"drive_processor{suffix}_share"] = ([self._taken / seconds], "of a core, by the policy node")
+        return figures, stops(drive), int((intervals > 150).sum())
+
+
+def histogram(delays: np.ndarray) -> dict[str, list[float]]:
+    """Return how many delays lie between each two of some bounds [ms]; the last bin has no upper one."""
+    bounds = [0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 30, 40, 60, 100]
+    counts, _ = np.histogram(delays, [*bounds, np.inf])
+    return {"histogram_from_ms": [float(one) for one in bounds], "histogram_counts": [float(one) for one in counts]}
+
+
+def measure_steady(policy: Path, folder: Path, domain: int, seconds: float, kinds: Sequence[str], together: bool
+                   ) -> Figures:
+    """Return latency, pacing, delivery, spurious stops and memory of undisturbed drives.
+
+    Args:
+        policy: what drives.
+        folder: for the results of the nodes.
+        domain: ROS domain of the first drive.
+        seconds: of each drive.
+        kinds: which of `STEADY`.
+        together: drive all at once, each on two cores of its own, instead of one after another on all cores.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    batches = [list(kinds)] if together else [[kind] for kind in kinds]
     figures: Figures = {}
-    healthy_stops, missed, growth, memory = 0, 0, [], []
-    for number, suffix in enumerate(("", "_realtime")):
-        run = Run(folder, policy, "EndlessRobot", domain + 2 * number, realtime=bool(suffix))
-        time.sleep(5)
-        before, taken = memory_mb(run.drive.pid), processor_seconds(run.drive.pid)
+    healthy_stops, missed, growth, memory, healthy, load = 0, 0, [], [], 0.0, []
+    for number, batch in enumerate(batches):
+        runs = [SteadyRun(STEADY[kind], folder, policy, domain + number + i, cores[2 * i:2 * i + 2] if together else ())
+                for i, kind in enumerate(batch)]
+        time.sleep(START)
+        for run in runs:
+            run.mark()
         time.sleep(seconds)
-        taken = processor_seconds(run.drive.pid) - taken
-        memory.append(memory_mb(run.drive.pid))
-        growth.append(memory[-1] - before)
-        results, drive = run.finish()
-        healthy_stops += stops(drive)
-        delays, intervals = settled(results)
-        missed += int((intervals > 150).sum())
-        figures[f"drive_processor{suffix}_share"] = ([taken / seconds], "of a core, by the policy node")
-        figures[f"frame_to_command_p50{suffix}_ms"] = ([float(np.percentile(delays, 50))], "ms")
-        figures[f"frame_to_command_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
-        figures[f"frame_to_command_max{suffix}_ms"] = ([float(delays.max())], "ms")
-        figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(np.abs(intervals - 100), 99))], "ms")
-        run = Run(folder, policy, "EndlessRobot", domain + 2 * number + 1, "--image-size", "720", "1280",
-                  realtime=bool(suffix))
-        time.sleep(seconds + 5)
-        results, drive = run.finish()
-        healthy_stops += stops(drive)
-        delays, intervals = settled(results)
-        missed += int((intervals > 150).sum())
-        figures[f"frame_720p_p99{suffix}_ms"] = ([float(np.percentile(delays, 99))], "ms")
-        end = results["commands"][-results["stops_at_end"]][0]  # the policy node's farewell
-        shown = sum(t < end - 0.01 for t in results["image_times"])
-        figures[f"frames_720p_delivered{suffix}"] = ([min(1.0, drive["counts"]["frames"] / shown)], "share")
-    figures["load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the runs above")
-    figures["healthy_stops"] = ([float(healthy_stops)], f"stops in {4 * (seconds + 5):.0f} healthy seconds")
-    figures["missed_ticks"] = ([float(missed)], f"commands 50 ms late in {4 * seconds:.0f} healthy seconds")
-    figures["drive_memory_mb"] = (memory, "MB of the policy node, resident, after a drive")
-    figures["memory_growth_mb"] = (growth, f"MB in {seconds:.0f} s, after the first 5 s")
+        load.append(os.getloadavg()[0])
+        for run in runs:
+            run.mark()
+            found, stopped, late = run.finish(seconds)
+            figures |= found
+            if run.kind.healthy:
+                healthy_stops, missed, healthy = healthy_stops + stopped, missed + late, healthy + seconds
+                memory.append(run.memory[-1])
+                growth.append(run.memory[-1] - run.memory[0])
+    figures["load_average"] = (load, f"processes wanting one of {os.cpu_count()} cores, during the runs above")
+    if healthy:
+        about = f"in {healthy:.0f} healthy seconds of {len(memory)} drives"
+        figures["healthy_stops"] = ([float(healthy_stops)], f"stops {about}")
+        figures["missed_ticks"] = ([float(missed)], f"commands 50 ms late {about}")
+        figures["drive_memory_mb"] = (memory, "MB of the policy node, resident, after a drive")
+        figures["memory_growth_mb"] = (growth, f"MB in {seconds:.0f} s, after the first {START:.0f} s")
     return figures
 
 
 def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, resets: int) -> Figures:
     """Return the reactions to a camera that falls silent, at resets, and to an action that is not a number."""
-    run = Run(folder, policy, "ShortRobot", domain, "--episodes", str(resets))
+    run = Run(folder, policy, "ShortRobot", Place(domain), "--episodes", str(resets))
     run.simulate.wait(30 + 4 * resets)
     results, _ = run.finish()
     moved = [t for t, v, omega in results["commands"] if v or omega]
@@ -379,7 +393,7 @@ def measure_episodes(policy: Path, stand_in: Path, folder: Path, domain: int, re
     episodes = [episode for episode in results["episodes"] if any(0 <= episode["ended"] - t < 0.2 for t in moved)]
     stale = sum(1 for begin in (episode["began"] for episode in episodes[1:])
                 for t, v, omega in results["commands"] if begin - 0.15 < t < begin + 0.1 and (v or omega))
-    run = Run(folder, stand_in, "WhiteRobot", domain + 1, "--episodes", "4")
+    run = Run(folder, stand_in, "WhiteRobot", Place(domain + 1), "--episodes", "4")
     run.simulate.wait(90)
     white_results, _ = run.finish()
     whites = [episode["began"] + 0.1 * WhiteRobot.white_at for episode in white_results["episodes"]]
@@ -429,35 +443,58 @@ def main() -> None:
     parser.add_argument("--seconds", type=in_range(0), default=60.0, help="length of each steady run")
     parser.add_argument("--resets", type=whole(0), default=20)
     parser.add_argument("--repeats", type=whole(), default=5, help="of each fault")
-    parser.add_argument("--faults", nargs="+", choices=tuple(FAULTS), default=tuple(FAULTS))
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS)
     parser.add_argument("--policy", type=Path, help="policy file to measure; default: a stand-in of 10 M parameters")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
+    parser.add_argument("--steady", nargs="+", choices=tuple(STEADY), default=tuple(STEADY),
+                        help="which steady runs; busy: beside two processes that take all they get")
+    parser.add_argument("--together", action="store_true",
+                        help="all steady runs at once, each on two cores of its own")
+    parser.add_argument("--domain", type=whole(1, 95), help="first of six ROS domains; none takes one by the process")
     options = parser.parse_args()
+    cores = len(os.sched_getaffinity(0))
+    if options.together and cores < 2 * len(options.steady):
+        parser.error(f"--together: {len(options.steady)} steady runs need {2 * len(options.steady)} cores, and there "
+                     f"are {cores}. Leave it out")
     figures: Figures = {}
-    domain = 1 + os.getpid() % 60
+    domain = options.domain or 1 + os.getpid() % 90
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         stand_in = export_stand_in(folder / "stand_in")
         policy = options.policy or stand_in
         if "steady" in options.parts:
-            figures |= measure_steady(policy, folder, domain, options.seconds)
+            options.steady = [kind for kind in options.steady if not STEADY[kind].realtime or may_run_in_real_time()]
+            figures |= measure_steady(policy, folder, domain, options.seconds, options.steady, options.together)
         if "episodes" in options.parts:
-            figures |= measure_episodes(policy, stand_in, folder, domain + 4, options.resets)
+            figures |= measure_episodes(policy, stand_in, folder, domain, options.resets)
         if "faults" in options.parts:
-            figures |= measure_faults(policy, domain + 6, options.repeats, options.faults)
+            figures |= measure_faults(stand_in, domain, options.repeats, options.faults)
+            rows = fault_rows()
+            figures["faults_untested"] = ([float(sum(not checks for _, checks in rows))],
+                                          f"of {len(rows)} rows of the fault table, without figure or test")
             figures["faults_load_average"] = ([os.getloadavg()[0]], "processes wanting a core, during the faults")
         if "fuzz" in options.parts:
-            figures["fuzz_outside_limits"] = ([float(fuzz(1_000_000))], "of 1,000,000 outputs of any 64 bits")
+            of = "of 1,000,000 outputs of any 64 bits"
+            for name, found in zip(("fuzz_outside_limits", "fuzz_outside_slew"), fuzz(1_000_000), strict=True):
+                figures[name] = ([float(found)], of)
         if "policy" in options.parts:
             figures |= measure_policy(policy, options.seconds)
 
-    from benchmarks.harness import figure, record
+    from benchmarks.harness import record
 
     cpu = f"cpu, {len(os.sched_getaffinity(0))} cores, {cpu_model()}"
-    path = record("bridge", CLAIM, {name: figure(repeats, unit, cpu) for name, (repeats, unit) in figures.items()})
-    for name, (repeats, unit) in figures.items():
+    path = record("bridge", CLAIM, entries(figures, cpu))
+    for name, (repeats, unit, *_) in figures.items():
         print(f"{name:28s} {statistics.median(repeats):10.3f} {unit}")
     print(path)
+
+
+def entries(figures: Figures, device: str) -> dict[str, Any]:
+    """Return figures as a result file has them."""
+    from benchmarks.harness import figure
+
+    return {name: {**figure(repeats, unit, device), **(more[0] if more else {})}
+            for name, (repeats, unit, *more) in figures.items()}
 
 
 def cpu_model() -> str:

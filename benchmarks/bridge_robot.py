@@ -63,8 +63,10 @@ class Robot:
         self.statuses: list[dict[str, Any]] = []
         self.frames = 0
         self.clock_offset, self.encoding, self.frozen = 0.0, "rgb8", False  # of the camera
-        self.dark = False
-        """Whether the camera's images are black, but for noise."""
+        self.shade = 255
+        """Grey of the camera's image."""
+        self.dark = self.short = False
+        """Whether the camera's images are black but for noise, and whether their last row is missing."""
         self.stamp, self.repeats_stamp = 0.0, False
         """Stamp of the last image [s], and whether the next ones have the same."""
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -113,20 +115,20 @@ class Robot:
         return Switch(self, topic, False)
 
     def camera(self, topic: str = "sensing/camera/front/image_raw", rate: float = 10,
-               size: tuple[int, int] = (64, 64), shade: int = 255) -> Any:
+               size: tuple[int, int] = (64, 64)) -> Any:
         """Publish images of one shade of grey, each different from the last unless `frozen`; return the timer."""
         from bridge import ros
 
         image = message_type("sensor_msgs/Image")
         publisher = self.node.create_publisher(image, topic, ros.best_effort())
-        pixels = bytearray([shade]) * (size[0] * size[1] * 3)
 
         def make() -> Any:
             self.frames += 1
-            pixels[0] = 5 if self.frozen else self.frames % 250
-            message = image(height=size[0], width=size[1], encoding=self.encoding, step=3 * size[1])
-            black = bytearray([self.frames % 3]) + bytearray(len(pixels) - 1)
-            message.data = array.array("B", black if self.dark else pixels)
+            row, rest = 3 * size[1], 3 * size[0] * size[1] - 1
+            number, grey = (self.frames % 3, 0) if self.dark else (self.frames % 250, self.shade)
+            pixels = bytes([5 if self.frozen else number]) + bytes([grey]) * rest
+            message = image(height=size[0], width=size[1], encoding=self.encoding, step=row)
+            message.data = array.array("B", pixels[:-row] if self.short else pixels)
             if not self.repeats_stamp:
                 self.stamp = time.time() + self.clock_offset
             message.header.stamp.sec, message.header.stamp.nanosec = int(self.stamp), int(self.stamp % 1 * 1e9)
@@ -154,11 +156,11 @@ class Robot:
 
         self.repeat(self.publisher("rosgraph_msgs/Clock", "/clock"), 0.01, make)
 
-    def whole(self, shade: int = 255) -> Switch:
+    def whole(self) -> Switch:
         """Be a whole vehicle with base, camera and status; return its emergency stop."""
         self.base()
         self.watch()
-        self.camera(shade=shade)
+        self.camera()
         return self.e_stop()
 
     def commander(self, v: float, topic: str = "whill/controller/cmd_vel", kind: str = "geometry_msgs/Twist"

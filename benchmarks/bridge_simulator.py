@@ -25,8 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bridge import CLAIM, EndlessRobot, Figures, cpu_model, memory_mb
-from benchmarks.harness import figure, record
+from benchmarks.bridge import CLAIM, EndlessRobot, burners, cpu_model, entries, memory_mb
+from benchmarks.bridge_faults import Figures
+from benchmarks.harness import record
 from bridge.episodes import PATIENCE
 from bridge.options import Parser, in_range, whole
 from bridge.simulated import Frame
@@ -92,18 +93,6 @@ def numbers_of(image: np.ndarray) -> tuple[int, int]:
     """Episode and step, one of the first 64, that an image shows."""
     high, low = (int(value) for value in image[1, :2, 0])
     return 256 * high + low, int(np.flatnonzero(image[0, :, 0] != 120)[0])
-
-
-@contextlib.contextmanager
-def burners(count: int):
-    """Processes that take a core each."""
-    running = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for one in running:
-            one.kill()
-            one.wait()
 
 
 def environment_of(domain: int) -> dict[str, str]:
@@ -172,8 +161,8 @@ def measure_lock_step(domain: int, folder: Path, steps: int, resets: int) -> Fig
         env.close()
     finally:
         simulator.close()
-    return {"ros_env_steps_per_second": (rates, "1/s, lock-step, 64x64, a point robot"),
-            "ros_env_reset_p99_ms": ([float(np.percentile(took, 99))], f"ms of {resets} resets, image included")}
+    return {"ros_env_steps_per_s": (rates, "1/s, lock-step, 64x64, a point robot"),
+            "tcp_p99_ms": ([float(np.percentile(took, 99))], f"ms of {resets} resets, image included")}
 
 
 def measure_stale(domain: int, folder: Path, resets: int) -> Figures:
@@ -295,6 +284,10 @@ def measure_fuzz(domain: int, folder: Path, count: int) -> Figures:
             "tcp_fuzz_open_files": ([float(kept)], f"more open files after {sent} damaged messages")}
 
 
+FORMER = ("recorded_", "ros_env_steps_per_second", "ros_env_reset_p99_ms")
+"""Names that figures had before."""
+
+
 def main() -> None:
     """Measure and record."""
     parser = Parser(prog="python -m benchmarks.bridge_simulator", description=__doc__,
@@ -305,14 +298,17 @@ def main() -> None:
     parser.add_argument("--steps", type=whole(), default=500, help="of each of five rounds in lock-step")
     parser.add_argument("--resets", type=whole(), default=10_000)
     parser.add_argument("--messages", type=whole(), default=100_000, help="damaged ones")
+    parser.add_argument("--domain", type=whole(1, 97), help="first of five ROS domains; none takes one by the process")
     options = parser.parse_args()
-    domain, figures = 61 + os.getpid() % 30, {}
+    figures: Figures = {}
+    domain = options.domain or 61 + os.getpid() % 30
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if "record" in options.parts:
-            for number, kind in enumerate(("reliable", "best_effort")):
-                figures[f"recorded_{kind}"] = ([rows_kept(kind, domain + number, options.seconds, folder)],
-                                               "share of rows at 100 Hz, two burners")
+            kept = [rows_kept(kind, domain + number, options.seconds, folder)
+                    for number, kind in enumerate(("reliable", "best_effort"))]
+            figures["record_rows_kept"] = (kept, f"share of rows at 100 Hz in {options.seconds:.0f} s, two burners; "
+                                                 "reliable, best effort")
         if "lock_step" in options.parts:
             figures |= measure_lock_step(domain + 2, folder, options.steps, options.resets)
         if "stale" in options.parts:
@@ -321,8 +317,8 @@ def main() -> None:
             figures |= measure_fuzz(domain + 3, folder, options.messages)
     figures["simulator_load_average"] = ([os.getloadavg()[0]], "processes wanting a core, after the runs above")
     cpu = f"cpu, {len(os.sched_getaffinity(0))} cores, {cpu_model()}"
-    path = record("bridge", CLAIM, {one: figure(repeats, unit, cpu) for one, (repeats, unit) in figures.items()})
-    for one, (repeats, unit) in figures.items():
+    path = record("bridge", CLAIM, entries(figures, cpu), replacing=FORMER)
+    for one, (repeats, unit, *_) in figures.items():
         print(f"{one:28s} {statistics.median(repeats):10.3f} {unit}")
     print(path)
 

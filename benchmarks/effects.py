@@ -222,6 +222,8 @@ def draw(path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
     t, commands, names, seen = signatures()
     difference = seen[1:] - seen[0]
@@ -256,7 +258,15 @@ def draw(path: Path) -> None:
         panel.set_xlabel("t [s]", fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}")
+    colours = {f"place: {where}": plt.Line2D([], [], color=colour) for where, colour in COLOURS.items()}
+    figure.suptitle("What each effect changes: the drive with it, less the drive without it", fontsize=11)
+    figure.legend(colours.values(), colours.keys(), loc="outside lower right", ncols=len(COLOURS), frameon=False)
     figure.savefig(temporary, dpi=100, format="png")
+    about = PngInfo()
+    about.add_text("Description", " ".join(sorted(names)))  # a test reads which effects the picture shows
+    with Image.open(temporary) as picture:
+        small = picture.convert("RGB").quantize(64, dither=Image.Dither.NONE)
+    small.save(temporary, format="PNG", optimize=True, pnginfo=about)
     os.replace(temporary, path)
 
 

@@ -19,6 +19,7 @@ from benchmarks.harness import figure, record, time_calls
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import make_env
 from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, OptionError, run
+from whill_mjx.processor import device_per_core
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.sensors.camera import Camera
 from whill_mjx.sensors.depth import Depth
@@ -56,6 +57,8 @@ class Options:
     """Timed calls."""
     map: Path = Path("../shared/data/maps/stata_basement/stata_basement.yaml")
     """The real map."""
+    split: bool = True
+    """On a CPU: give each core its share of the instances."""
     soak: float = 1e8
     """Control steps of the long run, all instances together."""
 
@@ -63,6 +66,11 @@ class Options:
     def count(self) -> int:
         """Instances side by side."""
         return self.instances or (256 if on_cpu() else 16384)
+
+    @property
+    def devices(self) -> tuple:
+        """Devices among which the instances are split."""
+        return device_per_core(self.count) if self.split and on_cpu() else ()
 
 
 def on_cpu() -> bool:
@@ -73,27 +81,27 @@ def on_cpu() -> bool:
 def rates_of(batch: BatchEnv, options: Options) -> list[float]:
     """Control steps per second in each timed call, with random actions and new worlds after each episode."""
 
-    def one_step(state: Any, key: jax.Array) -> tuple[Any, Any]:
-        state, time_step = batch.step(state, jax.random.uniform(key, (batch.count, 2), minval=-1.0))
-        return state, (time_step.reward.sum(), jax.tree.map(jnp.max, time_step.obs))
+    def one_step(carry: Any, key: jax.Array) -> tuple[Any, Any]:
+        state, time_step = batch.step(carry[0], jax.random.uniform(key, (batch.count, 2), minval=-1.0))
+        return (state, time_step.obs), time_step.reward.sum()  # all that is observed is there after each step
 
-    roll = jax.jit(lambda state, key: jax.lax.scan(one_step, state, jax.random.split(key, options.steps)))
-    state = jax.block_until_ready(jax.jit(batch.reset)(jax.random.key(0))[0])
-    seconds = time_calls(lambda: roll(state, jax.random.key(1)), options.repeats)
+    roll = jax.jit(lambda carry, key: jax.lax.scan(one_step, carry, jax.random.split(key, options.steps)))
+    state, time_step = jax.block_until_ready(jax.jit(batch.reset)(jax.random.key(0)))
+    seconds = time_calls(lambda: roll((state, time_step.obs), jax.random.key(1)), options.repeats)
     return [batch.count * options.steps / one for one in seconds]
 
 
 def course(options: Options) -> dict[str, Any]:
     """The paper's obstacle course with its image; vehicles differ."""
     env, params = make_env("obstacle_course", random_looks=True)
-    rates = rates_of(make_batch(env, params, options.count, spread=0.05), options)
+    rates = rates_of(make_batch(env, params, options.count, spread=0.05, devices=options.devices), options)
     return {"cpu_control_steps_per_s" if on_cpu() else "control_steps_per_s_course": figure(rates, "1/s")}
 
 
 def observed(name: str, task: str | Task, sensors: Mapping[str, Sensor], options: Options) -> dict[str, Any]:
     """A task with these sensors."""
     env, params = make_env(task, observations=sensors)
-    rates = rates_of(make_batch(env, params, options.count), options)
+    rates = rates_of(make_batch(env, params, options.count, devices=options.devices), options)
     return {f"{'cpu_' if on_cpu() else ''}control_steps_per_s_{name}": figure(rates, "1/s")}
 
 
@@ -208,6 +216,8 @@ PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
 
 def main(options: Options) -> None:
     """Measure the parts and record each."""
+    if options.split:
+        device_per_core(1)  # before JAX starts
     for part in options.parts:
         if part not in PARTS:
             raise OptionError(f"--parts: unknown part {part!r} (known: {', '.join(PARTS)}). Correct it.")

@@ -53,7 +53,7 @@ def plant(settings: Benchmark) -> None:
     """The plant's plain chair: held-out position error against the spread between replicates."""
     log = load_log(settings.shared / "data" / "plant" / "plain")
     for preset in settings.presets:
-        fit = fit_log(log, FitConfig(preset=preset, iterations=settings.iterations, calibrate=settings.calibrate))
+        fit = fit_log(log, settings.fitted(preset=preset))
         figures, ratio = against_replicates(fit, log, f"plant_{preset}{settings.tag}")
         figures[f"plant_replicate_ratio_{preset}{settings.tag}"] = ratio
         if preset == "physical":
@@ -66,7 +66,7 @@ def plant(settings: Benchmark) -> None:
 def chair(settings: Benchmark) -> None:
     """The log that ships with the package."""
     log = load_log(CHAIR)
-    fit = fit_log(log, FitConfig(iterations=settings.iterations, calibrate=settings.calibrate))
+    fit = fit_log(log, settings.fitted())
     figures, ratio = against_replicates(fit, log, f"chair{settings.tag}")
     figures[f"chair_replicate_ratio{settings.tag}"] = ratio
     record("fit", CLAIM, figures)
@@ -93,14 +93,14 @@ def days(settings: Benchmark, name: str, trials: set[str] | None = None) -> None
         with tempfile.TemporaryDirectory() as folder:
             make_log(Path(folder) / "log", seed=seed)
             log = load_log(Path(folder) / "log").select(lambda one: trials is None or one.name in trials)
-        fit = fit_log(log, FitConfig(iterations=settings.iterations, calibrate=settings.calibrate))
+        fit = fit_log(log, settings.fitted())
         ratios.append(against_replicates(fit, log, name)[1]["value"])
         seconds.append(fit.seconds)
         print(f"day {seed}: {ratios[-1]:.3f}; as stated: {', '.join(fit.stated) or 'nothing'}", flush=True)
-    figures = {f"{name}_replicate_ratio{settings.tag}": figure(ratios, "-"),
-               f"seconds_{name}{settings.tag}": figure(seconds, "s")}
-    record("fit", CLAIM, figures)
-    show(figures)
+        figures = {f"{name}_replicate_ratio{settings.tag}": figure(ratios, "-"),
+                   f"seconds_{name}{settings.tag}": figure(seconds, "s")}
+        record("fit", CLAIM, figures)  # of the days so far
+        show(figures)
 
 
 def planted(settings: Benchmark) -> None:

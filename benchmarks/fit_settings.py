@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from benchmarks import fit_searches
+from sysid.search.settings import FitConfig
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class Benchmark:
     calibrate: bool = True
     """Of plant, chair, contact and few: fit true wheel sizes and the tracked point too. Without, figures have another
     name: what do these parameters cost on logs that do not need them?"""
+    all_sizes: bool = False
+    """Of the same parts: keep all of them free, needed or not."""
     repeats: int = 3
     """Timed fits."""
     seeds: tuple[int, ...] = (2000, 2001, 2002)
@@ -71,5 +74,9 @@ class Benchmark:
 
     @property
     def tag(self) -> str:
-        """What the names of figures of fits without calibration end in."""
-        return "" if self.calibrate else "_as_stated"
+        """What the names of figures of fits without calibration, or with all of it, end in."""
+        return "_all_free" if self.all_sizes else "" if self.calibrate else "_as_stated"
+
+    def fitted(self, **more: Any) -> FitConfig:
+        """Settings of a fit with these iterations and sizes."""
+        return FitConfig(iterations=self.iterations, calibrate=self.calibrate, all_sizes=self.all_sizes, **more)

@@ -62,7 +62,7 @@ def functions(root: Path = ROOT) -> Iterator[Function]:
 
 def pages(root: Path = ROOT) -> list[Path]:
     """README and the documents."""
-    return [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    return [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
 
 
 def dialect(root: Path = ROOT) -> int:

@@ -73,7 +73,7 @@ def healthy(random: Random, turning: float = 0.0, whole: bool = False) -> Robot:
              "ground_truth": random.choice([10.0, 20.0, 60.0] if whole else [4.0, 10.0, 20.0, 60.0])}
     noise, lost = random.uniform(0.2, 2.0), random.choice([0.0, 0.0, 0.02, 0.1])
     mount = random.uniform(-0.2, 0.2, 2), np.deg2rad(random.uniform(-1.0, 1.0))
-    scales, late = random.uniform(0.92, 1.08, 2), random.uniform(-0.1, 0.1)
+    scales, late = random.uniform(0.96, 1.04, 2), random.uniform(-0.1, 0.1)
     drives = []
     for drive in chosen:
         made = _other_robot(drive, size, speed, side)
@@ -334,6 +334,12 @@ def _commands_cut(drives: list[Drive], size: float, random: Random) -> list[Driv
     return made
 
 
+def _sizes(drives: list[Drive], size: float, random: Random) -> list[Drive]:
+    """Nominal sizes by which the odometry goes and turns too far, or not far enough."""
+    scale = 1 + size * random.choice([-1.0, 1.0])
+    return [_calibrated(drive, np.full(2, scale)) for drive in drives]
+
+
 def _set_back(drives: list[Drive], size: float, random: Random) -> list[Drive]:
     """Times of receipt of all streams by a recorder whose clock is set back; messages keep their order of receipt."""
     made = []
@@ -368,5 +374,6 @@ FAULTS: Sequence[Fault] = (
     Fault("tracked body turned", (20.0, 6.0, 1.0), "deg", _body_turned, "of its own heading"),
     Fault("outside pose late", (4.0, 1.5, 0.1), "s", _pose_late, "another clock"),
     Fault("commands late", (5.0, 2.5, 0.1), "s", _commands_late, "another clock", 1.0),
+    Fault("nominal sizes wrong", (0.2, 0.09, 0.01), "share", _sizes, "as far as the odometry says", 1.0),
     Fault("commands cut", (0.7, 0.5, 0.0), "share", _commands_cut, "commands end", 1.0),
 )

@@ -242,7 +242,7 @@ class Loop:
         with station(domain, self.out / "logs" / "drive") as here:
             here.start("policy", "bridge.drive", str(policy), "--base", "generic")
             process = here.start(
-                "simulate", "bridge.simulate", str(policy), "--simulator", "benchmarks.loop_world:ContactVehicle",
+                "simulate", "bridge.simulate", str(policy), "--simulator", "benchmarks.loop_world:contact_vehicle",
                 "--set", f"plant_seed={self.seed}", "--set", f"draw={self.options.draw}", "--episodes",
                 str(self.options.episodes), "--results", str(results), "--wait", "60")
             while process.poll() is None:

@@ -17,7 +17,8 @@ from benchmarks.plant.chair import Nominal
 from benchmarks.plant.make import plan as plan_day
 from benchmarks.plant.online import OnlinePlant
 from bridge.command_table import PERIOD, CommandTable, make_table, read_commands
-from bridge.record import TrialWriter, write_dataset_file
+from bridge.record import write_dataset_file
+from bridge.trial_writer import TrialWriter
 
 LIMITS = (2.0, 4.0)
 """Of the commands [m/s, rad/s], as those of `bridge.manoeuvre`."""

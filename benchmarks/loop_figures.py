@@ -53,7 +53,7 @@ def collect(runs: tuple[Path, ...]) -> None:
     named = [float(one["named"]) for one in last]
     gains = [one["held_out_removed"] for one in last if one["held_out_removed"] is not None]
     draws = [f"{name} {size:.3g}" for one in found for name, size in one["truth"].items()]
-    about = {"draws": draws, "verdicts": [one["verdict"] for one in last], "named": named}
+    about = {"count": len(runs), "draws": draws, "verdicts": [one["verdict"] for one in last], "named": named}
     figures = {
         "loop_named": {**figure([sum(named)], f"of {len(runs)} draws: the effect is in the class of a named one"),
                        **about},

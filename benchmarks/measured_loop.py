@@ -34,7 +34,7 @@ from benchmarks.fit_measured import CLAIM, thin
 from benchmarks.fit_scores import show
 from benchmarks.harness import figure, record
 from benchmarks.measured_laws import STARTS, ablate, make_bench
-from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, steps_of
+from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, fit_published, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.floor import BLOCKS, FloorChange, Measured, compared, in_blocks, sums_of
 from sysid.logs.lost_pose import lost, without_lost
@@ -49,9 +49,9 @@ from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.floor import floor_change
-from sysid.verdict.found import Thresholds
 from sysid.verdict.late_pose import NAME, yaw_rates
 from sysid.verdict.pipeline import find_missing
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.preparation import reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result
 from sysid.verdict.vehicles import fitted_after, fitted_before, named_alone, on_other_floor, refit_poses
@@ -96,7 +96,7 @@ class Benchmark:
     """Windows of 15 s of each of them."""
     cuts: tuple[int, ...] = tuple(range(TENTHS))
     """Cuts of the asphalt run into halves: each begins at one of its tenths."""
-    rounds: Annotated[int, COUNT] = 3
+    rounds: Annotated[int, COUNT] = 5
     """Loops at most, one after the other."""
     floor_model: tuple[str, ...] = ("turn_efficiency", "turn_lag", "acceleration_limit", "pose_delay")
     """Effects that the base model of `change` has besides the physical preset."""
@@ -301,6 +301,8 @@ def peers(settings: Benchmark) -> None:
         base, predicted = fit_kinematic(training, count)
         print(f"{count} numbers: {', '.join(f'{name} {value:.3g}' for name, value in base.items())}", flush=True)
         figures |= mean_errors(f"peer_{count}_numbers", errors(held, as_predictions(held, judged, predicted(judged))))
+    published = fit_published(log.training, training)(judged)
+    figures |= mean_errors("peer_published", errors(held, as_predictions(held, judged, published)))
     predicted = fit_network(training, base)
     figures |= mean_errors("peer_network", errors(held, as_predictions(held, judged, predicted(judged))))
     figures |= mean_errors("peer_ideal", errors(held, [ideal_replay(trial) for trial in held]))
@@ -365,7 +367,8 @@ def halves(settings: Benchmark) -> None:
     named = [loop["verdict"] == "named" or bool(loop["floor"] and loop["floor"]["name"]) for loop in loops]
     figures = {"half_false": figure([float(sum(named))], f"of {len(named)} halves of the asphalt run"),
                "half_unexplained": figure([float(sum(loop["verdict"] == "unexplained" for loop in loops))],
-                                          f"of {len(named)} halves of the asphalt run")}
+                                          f"of {len(named)} halves of the asphalt run"),
+               "half_cuts": figure([float(len(named))], "halves of the asphalt run")}
     show(figures)
     record("measured", CLAIM, figures)
 

@@ -3,9 +3,12 @@
 Written anew from their descriptions, fitted to the training steps and scored on the held-out ones of
 `benchmarks.measured_loop`. All see the commands and the speeds at the start, and nothing else.
 
-`kinematic`: scales of v and omega, one lag, one delay (4 numbers); a limit of the wheels' speed (5); a late pose and
-sideways slip v_y = -k v omega (7); a lag of turning of its own (8). `network`: a small network adds to the rates of
-change of that model's speeds and to the motion of its body.
+`published`: the powertrain and slip model of the data's publishers (Baril et al., "DRIVE", ICRA 2024). Each side
+follows its command by a delay, a lag and bounds, fitted to the wheels' speeds of the first 2 s. What a body lacks of an
+ideal drive is linear in v ahead, in v omega sideways, and in v omega, v and omega in yaw: by a Bayesian regression with
+a flat prior on the rest of each step. `kinematic`: scales of v and omega, one lag, one delay (4 numbers); a limit of
+the wheels' speed (5); a late pose and sideways slip v_y = -k v omega (7); a lag of turning of its own (8). `network`: a
+small network adds to the rates of change of that model's speeds and to the motion of its body.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.logs.records import PoseStream, Prediction, Trial, command_in_force
+from sysid.logs.streams import added_up
 
 DT = 0.05  # s
 BACK = 24  # steps of driving on as in the first instant, before the start: as late as a pose may be
@@ -33,6 +37,8 @@ BOUNDS = {"linear": (0.3, 1.5), "angular": (0.2, 1.5), "lag": (0.02, 2.0), "dela
           "late": (0.0, 1.1), "slip": (-0.3, 0.5), "turn_lag": (0.02, 3.0)}  # fmt: skip
 KINEMATIC = {4: ("linear", "angular", "lag", "delay"), 5: ("limit",), 7: ("late", "slip"), 8: ("turn_lag",)}
 """Numbers of each model beyond those of the one before it."""
+
+TRANSITORY = 2.0  # s of a step after which the publishers take it as steady
 
 
 @dataclass(frozen=True)
@@ -149,6 +155,88 @@ def fit_kinematic(data: Steps, count: int) -> tuple[dict[str, float], Callable[[
                 for at in (START, {**START, "limit": 4.0, "late": 0.4, "slip": 0.1, "turn_lag": 1.0})),
                key=lambda found: found.fun)
     return dict(zip(names, best.x.tolist(), strict=True)), lambda other: np.asarray(paths(jnp.asarray(best.x), other))
+
+
+def sides(twist: np.ndarray, half: float) -> np.ndarray:
+    """Speeds of the left and the right wheels (..., 2) [m/s] of an ideal drive with twists (..., 2)."""
+    return twist[..., :1] + half * twist[..., 1:] * np.array([-1.0, 1.0])
+
+
+def follow(command: np.ndarray, start: np.ndarray, lag: float, delay: float, bounds: tuple[float, float]) -> np.ndarray:
+    """Speeds (B, T) of one side of the wheels that follow commands (B, T) from their start (B,)."""
+    speed, out = start, []
+    for k in range(command.shape[1]):
+        out.append(speed)
+        target = speed if k * DT <= delay else command[:, k]
+        speed = np.clip(speed + DT / lag * (target - speed), *bounds)
+    return np.stack(out, axis=1)
+
+
+def regressors(v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, ...]:
+    """What the slip of a body is linear in, ahead, sideways and in yaw, each (..., 1 or 3)."""
+    return v[..., None], (v * omega)[..., None], np.stack([v * omega, v, omega], axis=-1)
+
+
+def fit_published(trials: tuple[Trial, ...], data: Steps) -> Callable[[Steps], np.ndarray]:
+    """Predictions (B, T, 3) of the publishers' model, fitted to trials with wheel speeds and outside poses."""
+    from scipy import optimize
+
+    streams = [trial.odometry for trial in trials if trial.odometry is not None]
+    count = round(TRANSITORY / DT)
+    grid = np.arange(count) * DT
+    wheels = np.stack([sides(np.stack([np.interp(grid, one.t, one.v), np.interp(grid, one.t, one.omega)], axis=-1),
+                             data.half_track) for one in streams])  # (B, count, 2)
+    asked = sides(data.command[:, :count], data.half_track)
+    powertrain = []
+    for side in range(2):
+        seen, bounds = wheels[..., side], (float(wheels[:, -1, side].min()), float(wheels[:, -1, side].max()))
+
+        def missed(free: np.ndarray, side: int = side, seen: np.ndarray = seen, bounds: Any = bounds) -> float:
+            return float(np.abs(follow(asked[..., side], seen[:, 0], free[0], free[1], bounds) - seen).mean())
+
+        best = min((optimize.minimize(missed, at, method="Nelder-Mead", bounds=[(DT, 3.0), (0.0, 1.0)])
+                    for at in ([0.3, 0.1], [0.8, 0.3])), key=lambda found: found.fun)
+        powertrain.append((*best.x.tolist(), bounds))
+    slips = fit_slip(trials)
+
+    def paths(other: Steps) -> np.ndarray:
+        asked, start = (sides(one, other.half_track) for one in (other.command, other.start))
+        left, right = (follow(asked[..., side], start[:, side], *powertrain[side]) for side in range(2))
+        v, omega = (left + right) / 2, (right - left) / (2 * other.half_track)
+        ahead, across, turn = (rows @ weights for rows, weights in zip(regressors(v, omega), slips, strict=True))
+        return integrated(v - ahead, -across, omega - turn)
+
+    return paths
+
+
+def fit_slip(trials: tuple[Trial, ...]) -> list[np.ndarray]:
+    """Weights of the slip ahead, sideways and in yaw: by how much bodies fell short of ideal drives with their wheel
+    speeds, between consecutive poses of the steady part of each step."""
+    inputs: list[np.ndarray] = []
+    short: list[np.ndarray] = []
+    for trial in trials:
+        pose, wheels = trial.ground_truth, trial.odometry
+        if pose is None or wheels is None:
+            continue
+        t, values = pose.t[pose.t >= TRANSITORY], pose.values[pose.t >= TRANSITORY]
+        dt, moved = np.diff(t), np.diff(values, axis=0)
+        middle = (values[1:, 2] + values[:-1, 2]) / 2
+        cos, sin = np.cos(middle), np.sin(middle)
+        body = np.stack([cos * moved[:, 0] + sin * moved[:, 1], cos * moved[:, 1] - sin * moved[:, 0], moved[:, 2]], -1)
+        ideal = np.stack([np.diff(added_up(wheels.t, rate, t)) for rate in (wheels.v, wheels.omega)], -1)
+        inputs.append(ideal / dt[:, None])
+        short.append((ideal[:, [0, 0, 1]] * [1.0, 0.0, 1.0] - body) / dt[:, None])
+    twist, slip = np.concatenate(inputs), np.concatenate(short)
+    return [np.linalg.lstsq(rows, slip[:, i])[0] for i, rows in enumerate(regressors(*twist.T))]
+
+
+def integrated(vx: np.ndarray, vy: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Poses (B, T, 3) from the start of bodies with speeds (B, T) ahead, to the left and in yaw."""
+    yaw = np.cumsum(omega, axis=1) * DT
+    middle = yaw - omega * DT / 2
+    cos, sin = np.cos(middle), np.sin(middle)
+    path = np.stack([np.cumsum(cos * vx - sin * vy, axis=1) * DT, np.cumsum(sin * vx + cos * vy, axis=1) * DT, yaw], -1)
+    return np.concatenate([np.zeros((len(path), 1, 3)), path[:, :-1]], axis=1)
 
 
 def fit_network(data: Steps, base: dict[str, float], seeds: tuple[int, ...] = (0, 1, 2)

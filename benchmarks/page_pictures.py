@@ -118,7 +118,7 @@ def drives(out: Path) -> None:
         axes.plot(0.1 * np.arange(count + 1), speeds, color=colour, label=label)
     axes.step(0.1 * np.arange(count), commands, where="post", color="0.4", ls="--", label="command")
     axes.set(xlabel="time [s]", ylabel="speed [m/s]")
-    axes.legend(frameon=False, fontsize=9, loc="center", bbox_to_anchor=(0.36, 0.4))
+    figure.legend(frameon=False, fontsize=9, loc="outside lower center", ncols=2)
     axes.spines[["top", "right"]].set_visible(False)
     save_figure(figure, out)
 

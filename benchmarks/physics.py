@@ -33,6 +33,7 @@ from bridge.options import Parser, whole
 from whill_mjx.effects import EFFECTS
 from whill_mjx.io.command_line import guarded
 from whill_mjx.logs.manoeuvres import command_table
+from whill_mjx.processor import device_per_core
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import drive, place
 from whill_mjx.vehicle.kinematics import reference_pose
@@ -248,7 +249,7 @@ def main() -> None:
     parser = Parser(
         prog="python -m benchmarks.physics", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    on_cpu = jax.devices()[0].platform == "cpu"
+    on_cpu = device_per_core(1)[0].platform == "cpu"
     counts = [512, 1024, 2048] if on_cpu else [1024, 32768, 131072]
     parser.add_argument("--instances", type=whole(), nargs="+", default=counts)
     parser.add_argument("--vehicles", nargs="+", default=["loaded", BASE, "whill_cr_paper"])

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import PartitionSpec
 
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.vehicle.config import VehicleConfig
@@ -51,11 +52,13 @@ def random_instances(
 def compiled_roll(
     vehicle: str, count: int, periods: int, dynamics: str = "fused", kernel: bool | None = VehicleConfig.kernel
 ) -> tuple[VehicleModel, Any, tuple]:
-    """The model, a compiled drive of `count` instances over `periods` control periods, and its arguments."""
+    """The model, a compiled drive of `count` instances over `periods` control periods, and its arguments.
+
+    Several devices of a processor (`whill_mjx.processor.device_per_core`) take a share of the instances each.
+    """
     model, params, states = random_instances(vehicle, count, dynamics, kernel)
     commands = jax.random.uniform(jax.random.key(1), (periods, count, 2), minval=-1.0)
 
-    @jax.jit
     def roll(params: VehicleParams, states: VehicleState, commands: jax.Array) -> VehicleState:
         def period(states: VehicleState, command: jax.Array) -> tuple[VehicleState, None]:
             return jax.vmap(lambda p, s, c: drive(model, p, s, c))(params, states, command), None
@@ -63,6 +66,16 @@ def compiled_roll(
         return jax.lax.scan(period, states, commands)[0]
 
     arguments = params, states, commands
+    cores = jax.devices() if jax.default_backend() == "cpu" else []
+    if len(cores) > 1 and count % len(cores) == 0:
+        rows, columns = PartitionSpec("instance"), PartitionSpec(None, "instance")
+        mesh = jax.sharding.Mesh(cores, ("instance",))
+        roll = jax.shard_map(roll, mesh=mesh, in_specs=(rows, rows, columns), out_specs=rows, check_vma=False)
+        arguments = tuple(
+            jax.device_put(one, jax.sharding.NamedSharding(mesh, where))
+            for one, where in zip(arguments, (rows, rows, columns), strict=True)
+        )
+    roll = jax.jit(roll)
     return model, roll.lower(*arguments).compile(), arguments
 
 

@@ -57,15 +57,19 @@ class Figures:
             self.used.append({"date": whole.get("date"), "command": whole["command"], **found})
         return found
 
-    def fill(self, text: str, stem: str) -> str | None:
-        """`text` with its cells filled in; None where it has cells and none of them was measured."""
+    def fill(self, text: str, stem: str, release: str | None = None) -> str | None:
+        """`text` with its cells filled in; None where it has cells and none of them was measured.
+
+        With `release`, * marks figures of other releases: the end of a text of which all are, else each of them.
+        """
         cells = list(CELL.finditer(text))
         entries = [self.entry(cell["stem"] or stem, cell["name"]) for cell in cells]
         if cells and not any(entries):
             return None
-        values = iter("-" if entry is None else shown(entry, cell["form"] or "")
-                      for cell, entry in zip(cells, entries, strict=True))
-        return CELL.sub(lambda cell: next(values), text)
+        older = [release is not None and entry is not None and entry.get("release") != release for entry in entries]
+        values = iter("-" if entry is None else shown(entry, cell["form"] or "") + "*" * (old and not all(older))
+                      for cell, entry, old in zip(cells, entries, older, strict=True))
+        return CELL.sub(lambda cell: next(values), text) + "*" * (all(older) and bool(cells))
 
 
 def shown(entry: dict[str, Any], form: str) -> str:
@@ -83,7 +87,7 @@ def shown(entry: dict[str, Any], form: str) -> str:
     if "range" in words:
         low, high = (number(end(entry["repeats"]) * factor) + unit for end in (min, max))
         return low if low == high else f"{low} to {high}"
-    value = entry["value"] if key is None else entry[key]
+    value = entry["value"] if key is None else entry.get(key)  # files of earlier runs lack newer fields
     return number(value if value is None else value * factor) + unit
 
 
@@ -157,22 +161,18 @@ def _note(stem: str) -> list[str]:
 
 
 def headlines(results: Path) -> str:
-    """Markdown table of HEADLINES; * marks what was measured before the present release."""
+    """Markdown table of HEADLINES, and a sentence on its marks if there are any."""
+    from whill_mjx import __version__
+
     figures = Figures(results)
     rows: list[tuple[str, ...]] = []
     for stem, what, value in HEADLINES:
         figures.used.clear()
-        cell = figures.fill(value, stem)
+        cell = figures.fill(value, stem, __version__)
         if cell is not None:
-            rows.append((what, cell + ("*" if older(figures.used) else ""), short_device(figures.used[0]["device"])))
-    return table(("what", "figure", "measured on"), rows)
-
-
-def older(used: list[dict[str, Any]]) -> bool:
-    """Whether one of these figures was measured by another release than the present one."""
-    from whill_mjx import __version__
-
-    return any(one.get("release") != __version__ for one in used)
+            rows.append((what, cell, short_device(figures.used[0]["device"])))
+    marks = "\n\nFigures with * were measured before the present release." if any("*" in row[1] for row in rows) else ""
+    return table(("what", "figure", "measured on"), rows) + marks
 
 
 def put_between_marks(text: str, block: str) -> str:

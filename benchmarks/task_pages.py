@@ -22,7 +22,7 @@ from whill_mjx.tasks.base import Task
 DOCS = Path(__file__).parent.parent / "docs"
 TERMS = {
     "goal": "{goal_reward:g} in the period in which the vehicle arrives",
-    "collision": "{collision_reward:g} in the period in which it touches something",
+    "collision": "{collision_reward:g} in the period in which the vehicle touches something",
     "progress": "{progress_gain:g} for each metre that the goal came nearer",
     "time": "{step_reward:g} in every control period",
     "smoothness": "-{smoothness_gain:g} for each rad/s by which the commanded yaw rate changed",
@@ -145,7 +145,7 @@ def page(name: str) -> str:
         "", "## End of an episode", "", "| ending | when |", "|---|---|",
         *(f"| `{ending}` | {said[ending].format(**words)} |" for ending in [*endings, "timeout", "diverged"]),
         "", "## Drawn anew for each episode", "", f"{(inspect.getdoc(kind.sample_world) or '').splitlines()[0]}",
-        *(["", "## Fields", "", "`--set NAME=VALUE` changes a field, as well as the limits and gains above.", "",
+        *(["", "## Fields", "", "`--set NAME=VALUE` changes one of these fields, and the limits and gains above.", "",
            "| field | default | meaning |", "|---|---|---|",
            *(f"| `{field}` | `{fields[field]!r}` | {texts[field]} |" for field in own)] if own else []),
         "", "## Training", "", training_text(task), "",

@@ -92,6 +92,8 @@ class Benchmark:
     """Which effects look alike, per set of sensors, into sysid/data/classes.json."""
     calibrate: bool = False
     """Fit what p-values come to where nothing is missing, on half of the sets, into sysid/data/null_p.json."""
+    replay: bool = False
+    """Judge all logs that have a verdict again, from the evidence in it."""
     collect: bool = False
     """Only write the figures from the verdicts that are there."""
     work: Path = Path("runs/undeclared")
@@ -121,6 +123,8 @@ def main(settings: Benchmark) -> None:
         look_alikes(settings)
     if settings.calibrate:
         undeclared_figures.calibrate(settings.work / "plant")
+    if settings.replay:
+        contact.replay(settings.work / "plant")
     if settings.collect:
         undeclared_figures.figures(settings.work / "plant", settings.driven)
 
@@ -131,15 +135,15 @@ def shared(settings: Benchmark) -> None:
     config = LoopConfig()
     ready = prepare(reference_of(references, config), references[0].spec, config)
     path = RESULTS / "undeclared_shared.json"
-    content = json.loads(path.read_text()) if path.exists() else {"sets": {}}
-    content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(),
-                   **provenance())
     for name in settings.sets:
         began = time.perf_counter()
         log = load_log(settings.data / "undeclared" / name)
         result = replace(find_missing(log, (), config, reference=ready), references=tuple(references))
         report = make_report(result)
         write_run(settings.work / "shared" / name, result, report)
+        content = json.loads(path.read_text()) if path.exists() else {"sets": {}}  # other processes have other sets
+        content.update(claim="Verdicts on logs with at most one undeclared effect each", device=device_name(),
+                       **provenance())
         content["sets"][name] = {
             "verdict": report["verdict"], "reason": report["reason"],
             "effects": [{key: one[key] for key in ("name", "kind", "class", "parameters", "p_value")}

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,8 @@ from benchmarks.undeclared_reference import USUAL, Driven
 from sysid.follow_up.calibrated import FILE, calibrated
 from sysid.intervals.statistics import upper_rate
 from sysid.pages.report import write_report
+from sysid.verdict import posterior as decision
+from sysid.verdict.posterior import Thresholds, from_json, posterior
 
 LEAST = 30
 """Logs with nothing in them on which p-values are calibrated at least."""
@@ -55,10 +60,12 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
     ratios = [one["heldout_ratio"] for _, one in cases if "heldout_ratio" in one]
     if ratios:
         found["heldout_ratio"] = figure(ratios, "held-out trajectory RMSE over the replicates' spread")
-    seconds = [one["seconds"] for _, one in cases if one["stage"] in ("scaled", "pair")]
-    if seconds:
-        found["seconds_per_log"] = figure(seconds, "s on one core, reference fit apart")
+    timed = [one for _, one in cases if one["stage"] in ("scaled", "pair") and "device" in one]
+    if timed:
+        found["seconds_per_log"] = figure([one["seconds"] for one in timed], "s on one core, reference fit apart",
+                                          timed[0]["device"])
     found.update(of_speed(work))
+    found.update(of_decision([one["findings"] for _, one in [*cases, *noisy] if one.get("findings")]))
     found = {name + driven.tag: one for name, one in found.items()}
     recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
     sizes = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}
@@ -247,7 +254,7 @@ def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
     inside, errors = [], []
     for truth, one in cases:
         for effect in one["effects"]:
-            if effect["name"] in truth and effect["name"] in SAME:
+            if effect["name"] in truth and effect["name"] in SAME and effect["parameters"]:
                 parameter, neutral, unit = SAME[effect["name"]]
                 driven, seen = neutral + unit * truth[effect["name"]], effect["parameters"][parameter]
                 inside.append(float(seen["interval"][0] <= driven <= seen["interval"][1]))
@@ -256,6 +263,21 @@ def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
         return {}
     return {"interval_coverage": figure([float(np.mean(inside))], f"share of {len(inside)} 95 % intervals"),
             "parameter_error": figure(errors, "of the size")}
+
+
+def of_decision(kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """How much decides, and how long a verdict from kept evidence takes."""
+    if not kept:
+        return {}
+    seconds = []
+    for one in kept:
+        began = time.perf_counter()
+        posterior(from_json(one), Thresholds())
+        seconds.append(time.perf_counter() - began)
+    return {"verdict_s": figure(seconds, "s from kept evidence, one core"),
+            "decision_thresholds": figure([float(len(fields(Thresholds)))], "thresholds"),
+            "decision_lines": figure([float(len(inspect.getsource(decision).splitlines()))],
+                                     "lines of sysid/verdict/posterior.py, all between kept evidence and verdict")}
 
 
 def of_speed(work: Path) -> dict[str, Any]:

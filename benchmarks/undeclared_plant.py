@@ -30,7 +30,9 @@ from sysid.logs.log import load_log
 from sysid.pages.loop_report import effects as named_effects
 from sysid.pages.loop_report import make_report, write_run
 from sysid.pages.report import write_report
+from sysid.verdict.found import LARGEST
 from sysid.verdict.pipeline import find_missing
+from sysid.verdict.posterior import Thresholds, as_json, from_json, posterior
 from sysid.verdict.result import LoopConfig, Prepared, Result
 
 RECORDED = RESULTS / "undeclared.json"
@@ -273,7 +275,7 @@ def judge(
     config = replace(config, without=job.without)
     result = find_missing(load_log(folder), (), config, reference=ready)
     content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, "noise": job.noise, **brief(result),
-               "seconds": time.perf_counter() - began}
+               "seconds": time.perf_counter() - began, "device": device_name()}
     if full and result.search.verdict == "named":
         report = make_report(result)
         write_run(work / "reports" / job.label, result, report)
@@ -287,6 +289,27 @@ def judge(
     write_report(work / "truth" / f"{job.label}.json", dict(job.effects))
     write_report(verdict, content)
     return content
+
+
+def replay(work: Path) -> None:
+    """Judge again what has a verdict, from the evidence in it, by the present decision. A set of effects that was not
+    the chosen one before has no intervals, and is contradicted only where it was put to the test."""
+    for path in sorted((work / "verdicts").glob("*.json")):
+        content = json.loads(path.read_text())
+        if content.get("findings") is None:
+            continue
+        findings = from_json(content["findings"])
+        judged = posterior(findings, Thresholds())
+        before = {one["name"]: one["parameters"] for one in content["effects"]}
+        content.update(verdict=judged.verdict, share=judged.share, weights=judged.weights)
+        chosen = None if judged.chosen is None else findings.sets[judged.chosen]
+        if chosen is not None and set(before) != set(chosen.effects):
+            before = {}
+        content["excess"][1] = findings.excess if chosen is None else chosen.left.excess
+        content["effects"] = [] if chosen is None or judged.verdict != "named" else [
+            {"name": name, "class": members[:LARGEST], "parameters": before.get(name, {}),
+             "p_value": p} for name, members, p in zip(chosen.effects, chosen.apart(), chosen.p, strict=True)]
+        write_report(path, content)
 
 
 def speed(work: Path, refit_nulls: int = 0) -> None:
@@ -321,6 +344,6 @@ def brief(result: Result) -> dict[str, Any]:
                        "scatter_least": one.agreement.least,
                        "predictions": [[each.falsifier.by, each.outcome, each.power] for each in one.falsifiers]}
                       for one in result.stood],
-            "steps": found.steps,
+            "weights": found.weights, "findings": None if found.findings is None else as_json(found.findings),
             "candidates": [[[one.hypothesis.key, one.gain, one.share, one.p, one.refit.q.tolist()] for one in each]
                            for each in found.rounds]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-COMMANDS = ("drive", "guard", "manoeuvre", "record", "simulate", "chair")
+COMMANDS = ("drive", "guard", "manoeuvre", "record", "simulate", "chair", "chair_joy")
 
 
 def first_line(name: str) -> str:

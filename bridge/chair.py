@@ -1,4 +1,4 @@
-"""Live odometry of a WHILL Model CR2, whose own driver publishes none.
+"""Publish live odometry of a WHILL Model CR2, whose own driver publishes none.
 
     python -m bridge.chair
 

@@ -12,9 +12,10 @@ from typing import Literal
 
 import numpy as np
 
-from bridge.image import Crop, ImageError, compressed_to_rgb8, to_rgb8
+from bridge.image import ImageError
 from bridge.policy import Policy
 from bridge.safety import Command, SafetyConfig, State, Supervisor
+from bridge.view import View
 
 BACKSTOP = 1.25
 """Periods without a command after which the last one is sent again (while its frame is young) or zero."""
@@ -30,7 +31,7 @@ class Controller:
     """One policy driving one vehicle."""
 
     def __init__(self, policy: Policy, safety: SafetyConfig, clock: Callable[[], float] = time.monotonic,
-                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False, crop: Crop | None = None,
+                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False, view: View | None = None,
                  on_novel: OnNovel = "stop") -> None:
         """Join a policy and its limits.
 
@@ -41,7 +42,7 @@ class Controller:
             on_blind: what a dark or saturated camera causes.
             pace_by_stamp: run the policy at its rate in the time of the stamps instead of the wall clock's, for a
                 simulator whose time is slower or faster than the wall clock.
-            crop: the part of the camera's image that the policy sees; None: all of it.
+            view: what the policy sees of the camera's image; None: all of it.
             on_novel: what images cause that surprise the policy more than its training did, where its file says how
                 much that is.
         """
@@ -57,8 +58,7 @@ class Controller:
         self._clock = clock
         self._on_blind = on_blind
         self._pace_by_stamp = pace_by_stamp
-        self._crop = crop
-        self._size = (policy.contract.height, policy.contract.width)
+        self._view = view or View((policy.contract.height, policy.contract.width))
         self._period = 1 / policy.contract.rate_hz
         self._due = -np.inf
         self._arrived = -np.inf
@@ -78,14 +78,13 @@ class Controller:
             height, width, encoding, step, data: the fields of sensor_msgs/Image.
         """
         self.image_bytes = height * step
-        return self._on_decoded(now, stamp, stamp_age, lambda: to_rgb8(height, width, encoding, step, data, self._size,
-                                                                       self._crop))
+        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.raw(height, width, encoding, step, data))
 
     def on_compressed(self, now: float, stamp: float, stamp_age: float, data: object) -> Command | None:
         """Take one sensor_msgs/CompressedImage, JPEG or PNG; times and result as of `on_image`."""
         content = bytes(data)  # type: ignore[call-overload]  # any buffer
         self.image_bytes = len(content)
-        return self._on_decoded(now, stamp, stamp_age, lambda: compressed_to_rgb8(content, self._size, self._crop))
+        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.compressed(content))
 
     def _on_decoded(self, now: float, stamp: float, stamp_age: float, decode: Callable[[], np.ndarray]
                     ) -> Command | None:

@@ -1,4 +1,4 @@
-"""The policy node: camera image in, wheel command out.
+"""Run the policy node: camera image in, wheel command out.
 
     python -m bridge.drive runs/corridor/policy
 
@@ -10,6 +10,7 @@ import argparse
 import math
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from bridge import parameters, ros
@@ -21,6 +22,7 @@ from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_
 from bridge.policy import Policy, PolicyFileError
 from bridge.safety import SafetyConfig
 from bridge.vehicle_node import NOT_ACTIVE, WATCH_PERIOD, VehicleNode, add_options, limits
+from bridge.view import view_of
 
 PAUSE = (0.01, 0.06)
 """Seconds after a frame between which there is time for housekeeping: the last command is out, the next frame far."""
@@ -43,6 +45,9 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="the image topic carries sensor_msgs/CompressedImage (JPEG or PNG)")
     parser.add_argument("--crop", type=whole(0, 100_000), nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),
                         help="the part of the camera's image that the policy sees [pixels]")
+    parser.add_argument("--calibration", type=Path, metavar="FILE",
+                        help="of the camera's lens (YAML of camera_calibration): the policy sees what the camera of "
+                        "its training would see")
     parser.add_argument("--stamp-age", type=in_range(0, infinite=True), default=SafetyConfig.stamp_age,
                         help="largest age of a stamp [s]; inf where camera and bridge share no clock")
     parser.add_argument("--frame-age", type=in_range(0, infinite=True), default=SafetyConfig.frame_age,
@@ -108,7 +113,7 @@ class DriveNode(VehicleNode):
         now, simulated = time.monotonic(), self.node.get_clock().now().nanoseconds
         if simulated != self._simulated:
             self._ticked, self._simulated = now, simulated
-        self.supervisor.block(CLOCK_STANDS, now - self._ticked > self.options.frame_age)
+        self.supervisor.block(CLOCK_STANDS, now + WATCH_PERIOD - self._ticked > self.options.frame_age)
 
     def causes(self) -> list[str]:
         """Return what is wrong with camera, base and guard now, each with its remedy."""
@@ -160,13 +165,13 @@ def main(arguments: list[str] | None = None) -> int:
         options = parse_arguments(parameters.as_options(ros_arguments, ros.DRIVE_NAME, "policy") + own)
         policy = Policy.load(options.policy)
         safety = safety_config(policy, options)
+        view = view_of(policy.contract, options.crop and tuple(options.crop), options.calibration)
     except (PolicyFileError, ValueError) as error:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return 2
     with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
         controller = Controller(policy, safety, on_blind=options.blind, on_novel=options.novel,
-                                pace_by_stamp=options.pace == "stamp",
-                                crop=options.crop and tuple(options.crop))
+                                pace_by_stamp=options.pace == "stamp", view=view)
         drive = DriveNode(node, controller, options)
         try:
             ros.spin(node)

@@ -1,4 +1,4 @@
-"""An independent process that stops the vehicle when the policy node dies without a word.
+"""Stop the vehicle when the policy node dies: an independent process.
 
     python -m bridge.guard
 

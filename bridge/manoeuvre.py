@@ -1,4 +1,4 @@
-"""Drives a command file on the vehicle and records it: the manoeuvres of sysid.design, sysid.close_loop or your own.
+"""Drive a command file on the vehicle and record it: the manoeuvres of sysid.design, sysid.close_loop or your own.
 
     python -m bridge.manoeuvre command.csv --space 6 4 --dataset logs/monday --trial circle --repeat 3
 
@@ -25,8 +25,9 @@ from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
 from bridge.fitted_reach import simulate_reach
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
-from bridge.record import RecordNode, TrialWriter, add_dataset_options, write_dataset_file
+from bridge.record import RecordNode, add_dataset_options, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
+from bridge.trial_writer import TrialWriter
 from bridge.vehicle_node import VehicleNode, add_options, limits
 from bridge.vehicle_time import VehicleTime
 

@@ -49,20 +49,7 @@ def read_file(path: Path, node: str) -> dict[str, Any]:
     Raises:
         ValueError: the file is missing or is no parameter file.
     """
-    try:
-        if not path.is_file():
-            raise ValueError(f"{path}: no such file. Give an existing parameter file.")
-        with path.open("rb") as file:
-            content = file.read(LARGEST + 1)
-        text = content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: {error}. Give an existing parameter file.") from None
-    if len(content) > LARGEST:
-        raise ValueError(f"{path}: is larger than {LARGEST / 1000:g} kB. Give a parameter file.")
-    try:
-        sections = _yaml(text)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    sections = load_yaml(path, LARGEST, "Give an existing parameter file.")
     if not isinstance(sections, dict):
         raise ValueError(f"{path}: holds {type(sections).__name__}; a parameter file maps node names to "
                          "`ros__parameters`. Correct it.")
@@ -75,6 +62,28 @@ def read_file(path: Path, node: str) -> dict[str, Any]:
                                  "of them by name. Correct it.")
             values.update(table)
     return values
+
+
+def load_yaml(path: Path, largest: int, remedy: str) -> Any:
+    """Return the content of a YAML file of at most `largest` bytes.
+
+    Raises:
+        ValueError: naming the file and what is wrong with it; `remedy` follows where it cannot be read.
+    """
+    try:
+        if not path.is_file():
+            raise ValueError(f"{path}: no such file. {remedy}")
+        with path.open("rb") as file:
+            content = file.read(largest + 1)
+        text = content.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: {error}. {remedy}") from None
+    if len(content) > largest:
+        raise ValueError(f"{path}: is larger than {largest / 1000:g} kB. {remedy}")
+    try:
+        return _yaml(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _is_plain(value: Any) -> bool:

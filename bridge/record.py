@@ -1,6 +1,7 @@
-"""Records one drive as a trial of a driving-log dataset, which `sysid.fit` reads.
+"""Record one drive as a trial of a driving-log dataset, which `sysid.fit` reads.
 
     python -m bridge.record logs/monday figure_eight_1
+    python -m bridge.record logs/monday afternoon --split 3      # afternoon_1, afternoon_2, ...: one for each drive
 
 Every message counts: readers fit the publishers' quality of service and let many messages wait. `t` is the time of
 receipt on the steady clock; the column `stamp` keeps the message's own stamp.
@@ -10,34 +11,22 @@ killed recorder leaves the hidden folder with all rows but the last second's; `-
 """
 
 import argparse
-import contextlib
 import importlib
 import math
 import os
-import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandListener
-from bridge.mcap_file import McapWriter, mend
+from bridge.mcap_file import mend
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
+from bridge.split_writer import SplitWriter
 from bridge.streams import DEPTH, Stream
-
-COLUMNS = {
-    "command": ("t", "v", "omega"),
-    "odometry": ("t", "x", "y", "yaw", "v", "omega", "stamp"),
-    "ground_truth": ("t", "x", "y", "yaw", "stamp"),
-    "imu": ("t", "gyro", "stamp"),
-}
-MCAP = "recording.mcap"
-"""File of a trial with the whole messages of all topics."""
-TRIAL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
-PARTIAL = re.compile(r"\.(?P<trial>[A-Za-z0-9][\w.-]*)\.partial-(?P<process>\d+)")
-
+from bridge.trial_writer import MCAP, PARTIAL, TrialWriter
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 """Types that are kept whole on request only: they take megabytes a second."""
@@ -45,159 +34,6 @@ AHEAD = 1.0
 """Seconds by which a stamp may be ahead of this node's clock; one that is further is of another clock."""
 LOOK_PERIOD = 0.1
 """Seconds between two looks for publishers."""
-
-
-class TrialWriter:
-    """Writes the streams of one trial. Times count from the first pose; the command then in force becomes row one."""
-
-    def __init__(self, dataset: str | Path, trial: str) -> None:
-        """Open the trial for writing.
-
-        Raises:
-            ValueError: the trial exists already, or its name is no plain file name.
-        """
-        self.folder = self.check(dataset, trial)
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
-        self._partial = Path(dataset) / f".{trial}.partial-{os.getpid()}"
-        self._partial.mkdir()
-        self._files: dict[str, IO[str]] = {}
-        self._mcap: McapWriter | None = None
-        self._origin: float | None = None
-        self._waiting: tuple[float, float] | None = None
-        self._last: dict[str, float] = {}
-        self._first_pose: tuple[float, float, float] | None = None
-        self._yaw: float | None = None
-        self.rows = dict.fromkeys(COLUMNS, 0)
-
-    @staticmethod
-    def check(dataset: str | Path, trial: str) -> Path:
-        """Return the folder of a trial that can be recorded.
-
-        Raises:
-            ValueError: as the constructor.
-        """
-        if not TRIAL_NAME.fullmatch(trial):
-            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
-                             "Choose another name, like circle_1.")
-        folder = Path(dataset) / "trials" / trial
-        if folder.exists():
-            raise ValueError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
-        return folder
-
-    def begin(self, t: float) -> None:
-        """Let times count from t [s] instead of the first pose, so that repeats of a drive have the same times.
-
-        What was measured up to then is left out: it may come late, and be of the time before the vehicle was put to its
-        start.
-        """
-        self._origin = t
-        self._last = {stream: 0.0 for stream in COLUMNS if stream != "command"}
-
-    def command(self, t: float, v: float, omega: float) -> None:
-        """Add a command: t [s] of any steady clock, v [m/s], omega [rad/s]."""
-        if self._origin is None:
-            self._waiting = (v, omega)
-        else:
-            self._add("command", t, v, omega)
-
-    def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float, stamp: float = 0.0) -> None:
-        """Add what the vehicle's odometry reports; it is moved to start at the origin with heading 0, yaw unwrapped.
-
-        `stamp` [s] is the message's own time, on whatever clock the vehicle has; 0 where it has none.
-        """
-        if self._is_early("odometry", t):
-            return
-        if self._first_pose is None or self._yaw is None:
-            self._first_pose, self._yaw = (x, y, yaw), yaw
-        x0, y0, yaw0 = self._first_pose
-        self._yaw += math.remainder(yaw - self._yaw, 2 * math.pi)
-        dx, dy = x - x0, y - y0
-        along = math.cos(yaw0) * dx + math.sin(yaw0) * dy
-        left = -math.sin(yaw0) * dx + math.cos(yaw0) * dy
-        self._add("odometry", t, along, left, self._yaw - yaw0, v, omega, stamp)
-
-    def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
-        """Add an outside measurement of the drive-axle centre in the room."""
-        self._add("ground_truth", t, x, y, yaw, stamp)
-
-    def imu(self, t: float, gyro: float, stamp: float = 0.0) -> None:
-        """Add the yaw rate [rad/s] of an inertial measurement unit."""
-        self._add("imu", t, gyro, stamp)
-
-    def message(self, topic: str, kind: Any, data: bytes) -> None:
-        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file."""
-        if self._mcap is None:
-            self._mcap = McapWriter(self._partial / MCAP)
-        self._mcap.write(topic, kind, data)
-
-    def flush(self) -> None:
-        """Hand the rows so far to the operating system."""
-        for file in self._files.values():
-            file.flush()
-        if self._mcap is not None:
-            self._mcap.flush()
-
-    def close(self) -> Path:
-        """End the recording: give the trial its name and return its folder.
-
-        Raises:
-            OSError: the last rows could not be written; the rest lies in the folder that the message names.
-        """
-        failure = None
-        for file in self._files.values():
-            try:
-                file.flush()
-                os.fsync(file.fileno())
-            except OSError as error:
-                failure = error
-            finally:
-                with contextlib.suppress(OSError):
-                    file.close()
-        if self._mcap is not None:
-            try:
-                self._mcap.close()
-            except OSError as error:
-                failure = error
-        if failure is not None:
-            raise OSError(failure.errno, f"{failure.strerror}: the recording is cut off; what was written lies in "
-                                         f"{self._partial}. Make room and record again")
-        os.replace(self._partial, self.folder)
-        return self.folder
-
-    def put_aside(self) -> Path:
-        """End a recording that is no trial, such as a stopped drive; return its folder, below `aborted` in the dataset.
-
-        Raises:
-            OSError: as `close`.
-        """
-        aside = self.folder.parent.with_name("aborted")
-        aside.mkdir(exist_ok=True)
-        self.folder = aside / f"{self.folder.name}.{sum(1 for _ in aside.iterdir()) + 1}"
-        return self.close()
-
-    def _is_early(self, stream: str, t: float) -> bool:
-        """Return whether a time is before the start of the trial, or no later than the last row of the stream."""
-        if self._origin is None:
-            return False
-        since = round(t - self._origin, 6)
-        return since < 0 or since <= self._last.get(stream, -math.inf)
-
-    def _add(self, stream: str, t: float, *values: float) -> None:
-        if not all(math.isfinite(value) for value in (t, *values)):
-            return  # a log holds measurements; a fit cannot use a hole with a number's name
-        if stream not in self._files:
-            self._files[stream] = open(self._partial / f"{stream}.csv", "w", encoding="utf-8")
-            self._files[stream].write(",".join(COLUMNS[stream]) + "\n")
-        if self._origin is None:
-            self._origin = t
-            if self._waiting is not None:
-                self._add("command", t, *self._waiting)
-        if self._is_early(stream, t):
-            return  # stamped before the start, or two messages within a microsecond
-        t = round(t - self._origin, 6) + 0.0  # a time a little before the start is 0 and not -0
-        self._last[stream] = t
-        self._files[stream].write(f"{t:.6f}," + ",".join(f"{value:.6f}" for value in values) + "\n")
-        self.rows[stream] += 1
 
 
 def write_dataset_file(dataset: Path, options: argparse.Namespace) -> None:
@@ -260,13 +96,14 @@ class RecordNode:
     one has the node's time at its receipt.
     """
 
-    def __init__(self, node: Any, writer: TrialWriter | None, options: argparse.Namespace, seconds: float = 0.0
-                 ) -> None:
+    def __init__(self, node: Any, writer: TrialWriter | SplitWriter | None, options: argparse.Namespace,
+                 seconds: float = 0.0) -> None:
         """Listen on the graph, for so long [s] or without end. What comes is dropped while `writer` is None."""
         from nav_msgs.msg import Odometry
         from sensor_msgs.msg import Imu
 
-        self.writer = writer
+        self.writer: Any = writer
+        """What takes the rows; None while nothing is recorded."""
         self.failure: OSError | None = None
         """Why the recording ended early, such as a full disk."""
         self._started = time.monotonic()
@@ -349,7 +186,7 @@ class RecordNode:
         t = self._time(stamp)
         self._write(lambda writer: writer.imu(t, message.angular_velocity.z, stamp))
 
-    def _write(self, write: Callable[[TrialWriter], None]) -> None:
+    def _write(self, write: Callable[[Any], None]) -> None:
         """Write, and end the recording where that fails; the vehicle's nodes are other processes and drive on."""
         try:
             if self.writer is not None:
@@ -433,6 +270,9 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("dataset", type=Path, help="folder of the dataset; made where it does not exist")
     parser.add_argument("trial", nargs="?", help="name of the trial, like circle_1")
     parser.add_argument("--recover", action="store_true", help="only give recordings of killed recorders their place")
+    parser.add_argument("--split", type=in_range(0.5, 600), metavar="SECONDS",
+                        help="make a trial of each drive, TRIAL_1, TRIAL_2 and so on; a drive is over when the vehicle "
+                        "has stood for so long")
     parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
                         help="end after so long; 0: at Ctrl-C or SIGTERM")
     parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
@@ -467,15 +307,23 @@ def add_dataset_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--omega-limit", type=in_range(0.01, 100), default=1.0, help="[rad/s]")
 
 
-def finish(writer: TrialWriter) -> Path | None:
-    """End a recording and say what it holds; return its folder, None where its end could not be written."""
+def finish(writer: TrialWriter | SplitWriter) -> bool:
+    """End a recording and say what it holds; return whether its end could be written."""
     try:
         folder = writer.close()
     except OSError as error:
         print(f"bridge.record: {error}", file=sys.stderr)
-        return None
-    print(f"bridge.record: {folder}: rows {writer.rows}", file=sys.stderr)
-    return folder
+        return False
+    if isinstance(writer, TrialWriter):
+        say_trial(folder, writer.rows)
+    elif not writer.trials:
+        print("bridge.record: nothing was recorded: the vehicle never moved", file=sys.stderr)
+    return True
+
+
+def say_trial(folder: Path | None, rows: Mapping[str, int]) -> None:
+    """Say what a whole trial holds."""
+    print(f"bridge.record: {folder}: rows {dict(rows)}", file=sys.stderr)
 
 
 def main_recover(dataset: Path) -> int:
@@ -503,7 +351,11 @@ def main(arguments: list[str] | None = None) -> int:
     if options.recover:
         return main_recover(options.dataset)
     try:
-        writer = TrialWriter(options.dataset, options.trial)
+        writer: TrialWriter | SplitWriter
+        if options.split:
+            writer = SplitWriter(options.dataset, options.trial, options.split, say_trial)
+        else:
+            writer = TrialWriter(options.dataset, options.trial)
         write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
         print(f"bridge.record: {said(error)}", file=sys.stderr)
@@ -518,13 +370,13 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"bridge.record: {topic}: {count} messages were lost on the way. Record on the vehicle's own "
                       "computer, or let the publisher be reliable.", file=sys.stderr)
     finally:
-        folder = finish(writer)
-    if failed or folder is None:
+        whole = finish(writer)
+    if failed or not whole:
         print("bridge.record: the recording ended early, because nothing could be written any more", file=sys.stderr)
         return 4
     if not writer.rows["odometry"]:
-        print(f"bridge.record: {folder}/odometry.csv: no message came on {options.odometry_topic}, and a fit needs "
-              "odometry. Name the vehicle's topic with --odometry-topic.", file=sys.stderr)
+        print(f"bridge.record: no odometry was recorded: no message came on {options.odometry_topic}, or the vehicle "
+              "never moved. A fit needs it; name the vehicle's topic with --odometry-topic.", file=sys.stderr)
         return 3
     return 0
 

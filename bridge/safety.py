@@ -73,6 +73,8 @@ class SafetyConfig:
     """Largest change of a command: of v [m/s2], of omega [rad/s2]. A stop is not slowed by it."""
     frame_age: float = 0.25
     """Frames older than this [s] since their receipt stop the vehicle."""
+    tick: float = 0.01
+    """Seconds between two ticks: an age that would pass its limit before the next one stops the vehicle now."""
     stamp_age: float = 0.3
     """Stamps further than this [s] from the time of receipt are discarded; infinite where clocks are not shared."""
     resume_frames: int = 3
@@ -243,7 +245,7 @@ class Supervisor:
 
     def tick(self, now: float) -> Command:
         """Return the command to hold: the last one while its frame is young enough, else zero."""
-        if self._cause != NO_FRAME and self._frames.is_silent(now):
+        if self._cause != NO_FRAME and self._frames.is_silent(now + self.config.tick):
             self.fault("frame age")
         if self.state is State.YIELDED and now - self._foreign > self.config.quiet:
             self.latched = self.latched or "another node drove"

@@ -1,4 +1,4 @@
-"""The simulator behind the vehicle's topics, so that the policy node sees no difference from the chair.
+"""Run the simulator behind the vehicle's topics; the policy node sees no difference from the chair.
 
     python -m bridge.simulate RUN/policy --episodes 10
 
@@ -13,11 +13,12 @@ it stops, forgets, and no frame of an episode can reach the next one.
 import argparse
 import ast
 import contextlib
+import dataclasses
 import importlib
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -51,9 +52,10 @@ class ChairSimulator:
         import jax
 
         from whill_mjx import env as environment
-        from whill_mjx.sensors.lidar import distances
         from whill_mjx.tasks.tasks import make_task
         from whill_mjx.vehicle.kinematics import reference_pose
+        from whill_mjx.world.lidar import first_hits
+        from whill_mjx.world.people.contact import scene_without_people
         from whill_mjx.world.render import pinhole
 
         fields = {**changes, "action_repeat": 1}
@@ -70,10 +72,10 @@ class ChairSimulator:
 
         def scan(state: Any) -> Any:
             x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
-            return distances(x, y, yaw + angles, state.scene.boxes, SCAN_RANGE, (SCAN_HEIGHT, SCAN_HEIGHT))
+            return jax.numpy.minimum(first_hits(state.scene, x, y, yaw + angles, SCAN_HEIGHT), SCAN_RANGE)
 
         self._scan = jax.jit(scan)
-        self._occupied = jax.jit(lambda scene, x, y: _touched(scene, x, y))
+        self._occupied = jax.jit(lambda scene, x, y: _touched(scene_without_people(scene), x, y))
         self._key = jax.random.key
         self._reset = jax.jit(lambda key: environment.reset(env, params, key))
         self._step = jax.jit(lambda state, action: environment.step(env, params, state, action))
@@ -110,6 +112,89 @@ class ChairSimulator:
                      terminated=bool(time_step.terminated), reward=float(time_step.reward),
                      odometry=(reported[0], reported[1], reported[2], reported[3], reported[4]),
                      ranges=np.asarray(self._scan(self._state)))
+
+
+class Mover(Protocol):
+    """Any physics of one vehicle on a flat floor."""
+
+    def place(self, x: float, y: float, yaw: float) -> None:
+        """Stand still with the driven-axle centre at x, y [m], heading yaw [rad]."""
+
+    def advance(self, v: float, omega: float, seconds: float) -> None:
+        """Drive with a command, v [m/s], omega [rad/s]."""
+
+    @property
+    def motion(self) -> np.ndarray:
+        """(5,) x, y [m], yaw [rad], v [m/s], omega [rad/s] now."""
+
+    @property
+    def odometry(self) -> np.ndarray:
+        """(5,) the same as the vehicle reports it, from its start."""
+
+
+class MovedSimulator(ChairSimulator):
+    """The world and the camera of a task around another physics: a robot file, or a plant of one's own."""
+
+    def __init__(self, mover: Mover, task: str = "corridor", vehicle: Any = None, size: tuple[int, int] = (64, 64),
+                 **changes: Any) -> None:
+        """Prepare the world of a task; the vehicle gives camera and outline alone. Arguments as of `ChairSimulator`."""
+        super().__init__(task, vehicle, size, **changes)
+        self.mover = mover
+        self._look = self._make_look()
+
+    def _make_look(self) -> Any:
+        """Return the function that puts the vehicle into the scene and says what the camera and the task see."""
+        import jax
+        import jax.numpy as jnp
+
+        from whill_mjx.env import endings_of, moment_of, observe
+        from whill_mjx.vehicle.dynamics import place
+        from whill_mjx.vehicle.kinematics import reference_pose
+        from whill_mjx.world.people.contact import poses_among_people, walk_around
+        from whill_mjx.world.scene import footprint
+
+        env, params, spec, task = self.env, self.params, self.env.model.spec, self.env.task
+        fastest = max(abs(task.v_min), abs(task.v_max))
+        poses = poses_among_people(fastest, task.omega_max, self.period, spec.body_length / 2, spec.body_width / 2)
+
+        def look(state: Any, motion: Any, command: Any) -> Any:
+            vehicle = place(env.model, params, *motion)
+            count = state.step_count + 1
+            ran_into = jnp.asarray(False)
+            if state.scene.people is not None:
+                before, now = (footprint(spec, *reference_pose(env.model, one.qpos))
+                               for one in (state.vehicle, vehicle))
+                scene, ran_into, _ = walk_around(state.scene, before, now, self.period, poses)
+                state = dataclasses.replace(state, scene=scene)
+            moment = moment_of(env, state, vehicle, command, count)
+            moment = dataclasses.replace(moment, collided=moment.collided | ran_into,
+                                         reached=moment.reached & ~ran_into)
+            ends = endings_of(env.task, moment)
+            after = dataclasses.replace(state, vehicle=vehicle, command=jnp.asarray(command), step_count=count,
+                                        goal_distance=moment.goal_distance)
+            late = count >= env.task.max_steps
+            over = jnp.stack([*ends.values()]).any()
+            return after, observe(env, after), ends["collision"], ends["success"], over, late
+
+        return jax.jit(look)
+
+    def reset(self, seed: int) -> Frame:
+        """Begin the episode of a seed."""
+        frame = super().reset(seed)
+        self.mover.place(frame.x, frame.y, frame.yaw)
+        return dataclasses.replace(frame, odometry=(0.0,) * 5)
+
+    def step(self, v: float, omega: float) -> Frame:
+        """Advance one control period."""
+        command = np.clip([v, omega], self._low, self._low + self._span)
+        self.mover.advance(float(command[0]), float(command[1]), self.period)
+        motion = self.mover.motion
+        self._state, image, collided, reached, ended, late = self._look(
+            self._state, motion.astype(np.float32), command.astype(np.float32))
+        x, y, yaw, speed, turn = motion.tolist()
+        return Frame(np.asarray(image), x, y, yaw, speed, turn, collided=bool(collided), reached_goal=bool(reached),
+                     done=bool(ended | late), terminated=bool(ended), ranges=np.asarray(self._scan(self._state)),
+                     odometry=tuple(self.mover.odometry.tolist()))
 
 
 def _extent(scene: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -157,14 +242,23 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
                          "vehicle. Correct it or leave it out.") from error
     changes = dict(options.set)
     if options.policy is None:
-        return factory(task=options.task or "corridor", vehicle=options.vehicle, **changes)
-    from whill_mjx.evaluation.policy_world import read_world
+        given = {"task": options.task or "corridor", "vehicle": options.vehicle, **changes}
+    else:
+        from whill_mjx.evaluation.policy_world import read_world
 
-    world = read_world(options.policy)
-    same = options.task in (None, world.task)
-    fields = {**world.fields, **changes} if same else changes
-    return factory(task=options.task or world.task, vehicle=options.vehicle or world.vehicle,
-                   size=(world.height, world.width), **fields)
+        world = read_world(options.policy)
+        same = options.task in (None, world.task)
+        given = {"task": options.task or world.task, "vehicle": options.vehicle or world.vehicle,
+                 "size": (world.height, world.width), **(world.fields if same else {}), **changes}
+    if options.robot is None:
+        return factory(**given)
+    from sysid.replay.robot_online import OnlineRobot
+    from whill_mjx.env import as_vehicle
+
+    robot = OnlineRobot(options.robot, options.wheels or ())
+    given["vehicle"] = robot.spec(as_vehicle(given["vehicle"])[0])
+    moved: Any = MovedSimulator(robot, **given)
+    return moved
 
 
 def field(text: str) -> tuple[str, Any]:
@@ -189,6 +283,11 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="change a field of the task, such as gates=1 or layout=fixed; repeat for more")
     parser.add_argument("--vehicle", help="vehicle file or built-in vehicle; default: that of the policy, "
                         "or the task's own")
+    parser.add_argument("--robot", type=Path, metavar="FILE",
+                        help="an MJCF, URDF or xacro file, which drives in place of the vehicle; the camera stays that "
+                        "of --vehicle")
+    parser.add_argument("--wheels", nargs="+", metavar="NAME",
+                        help="of --robot: joints or actuators of its driven wheels, left and right")
     parser.add_argument("--episodes", type=whole(0), default=0, help="end after so many; 0: never")
     parser.add_argument("--seed", type=whole(0), default=0, help="of the first episode; each next one adds 1")
     parser.add_argument("--wait", type=in_range(0), default=10.0,

@@ -131,6 +131,7 @@ def parity(model: bytes, network: Network, steps: int) -> dict[str, Any]:
     """
     import onnxruntime
 
+    onnxruntime.set_default_logger_severity(3)  # errors alone, as in bridge.policy
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     names, (inputs, _), judged = list(network.carry), network.tensors, len(network.outputs) - 1
 

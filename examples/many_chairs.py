@@ -5,7 +5,7 @@ import argparse
 import jax
 import jax.numpy as jnp
 
-from whill_mjx import make_batch, make_env, share_results
+from whill_mjx import device_per_core, make_batch, make_env, share_results
 
 
 def main() -> None:
@@ -15,8 +15,9 @@ def main() -> None:
     given = parser.parse_args()
 
     share_results()  # before JAX starts: steps on a CPU are several times faster
+    devices = device_per_core(given.count)  # so too: each core steps its share
     env, vehicle = make_env("point_goal")
-    chairs = make_batch(env, vehicle, count=given.count, spread=0.1)
+    chairs = make_batch(env, vehicle, count=given.count, spread=0.1, devices=devices)
     state, step = jax.jit(chairs.reset)(jax.random.key(0))
     advance = jax.jit(chairs.step)
     for _ in range(given.steps):

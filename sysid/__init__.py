@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from sysid.search.fitting import fit_log as fit_log
     from sysid.search.fitting import predict as predict
     from sysid.search.settings import FitConfig as FitConfig
-    from sysid.verdict.found import Thresholds as Thresholds
     from sysid.verdict.pipeline import find_missing as find_missing
+    from sysid.verdict.posterior import Thresholds as Thresholds
     from sysid.verdict.preparation import prepare as prepare
     from sysid.verdict.result import LoopConfig as LoopConfig
 
@@ -44,7 +44,7 @@ _HOMES = {
     "mjcf_model": "sysid.replay.mjcf",
     "read_report": "sysid.pages.report",
     "LoopConfig": "sysid.verdict.result",
-    "Thresholds": "sysid.verdict.found",
+    "Thresholds": "sysid.verdict.posterior",
     "prepare": "sysid.verdict.pipeline",
     "find_missing": "sysid.verdict.pipeline",
 }

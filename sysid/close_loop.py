@@ -1,4 +1,4 @@
-"""From the residual to the missing effect: `python -m sysid.close_loop DATASET --reference DATASET ... --out RUN`.
+"""Find the physical effect that a model lacks: `python -m sysid.close_loop DATASET --reference DATASET ... --out RUN`.
 
 The base model is fitted to the reference drives. The drives in question are then asked what has changed or is missing
 against that vehicle: every effect of the catalogue is tried, the best are refitted together with the base parameters
@@ -36,7 +36,7 @@ from sysid.verdict.pipeline import check_logs, watched
 from sysid.verdict.result import LoopConfig
 
 KIND = "sysid.close_loop"
-OUTPUTS = ("next_command.csv", "method.html", "steps")
+OUTPUTS = ("next_command.csv", "method.html", "evidence.json", "steps")
 STOPPED = "stopped; give the same command again to go on."
 
 

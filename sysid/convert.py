@@ -1,4 +1,4 @@
-"""Converts recordings to a driving-log dataset: `python -m sysid.convert SOURCE --out DATASET`.
+"""Convert recordings to a driving-log dataset: `python -m sysid.convert SOURCE --out DATASET`.
 
 SOURCE is a ROS bag (rosbag2 folder, .db3, .mcap, ROS 1 .bag), a CSV or TUM file, a folder of them, a LeRobotDataset, or
 one of the published measured sets.

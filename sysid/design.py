@@ -1,4 +1,4 @@
-"""Proposes the next manoeuvre: `python -m sysid.design VEHICLE_OR_RUN --out command.csv --space 6 4`.
+"""Propose the next manoeuvre: `python -m sysid.design VEHICLE_OR_RUN --out command.csv --space 6 4`.
 
 Of a library of manoeuvres within limits of speed and room, the one is chosen that shrinks the uncertainty of the
 parameters most: A-optimal (the sum of variances, which the largest uncertainty rules) or D-optimal (the volume), both

@@ -7,7 +7,7 @@ was stopped goes on where it was when the same command is given again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,7 @@ if starts(__name__):
     listen()
 
 from sysid import command_line
+from sysid.logs.coverage import doubts
 from sysid.logs.measured import load_any
 from sysid.logs.records import Log
 from sysid.pages.fit_report import fit_dataset
@@ -68,6 +69,7 @@ def main(arguments: Arguments) -> None:
             raise ValueError("--wheels: only a --model has joints or actuators to name. Add it or leave this out.")
         settings = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
         log = load_any(arguments.dataset, arguments.format, arguments.train, arguments.held_out, arguments.chained)
+        log = replace(log, notes=(*log.notes, *doubts(log)))
         check_storage(settings)
         model = check_settings(log, settings)
         references = [load_any(path) for path in arguments.reference]

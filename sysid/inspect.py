@@ -1,4 +1,4 @@
-"""Looks at a driving log or a robot file before it is fitted: `python -m sysid.inspect DATASET|ROBOT [--out DIR]`.
+"""Inspect a driving log or a robot file before it is fitted: `python -m sysid.inspect DATASET|ROBOT [--out DIR]`.
 
 Says how regularly each stream was sampled, how the clocks differ, whether units and signs are right, what each trial
 excites, how well replicates repeat, and what no fit can find in the log. Of a robot file (URDF, xacro, MJCF) it says

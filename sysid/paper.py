@@ -1,4 +1,4 @@
-"""The reference paper's experiment on a driving log: `python -m sysid.paper DATASET --out RUN`.
+"""Repeat the reference paper's experiment on a driving log: `python -m sysid.paper DATASET --out RUN`.
 
 Its 13 parameters from its initial values, its objective J (sum over manoeuvres of the position RMSE), TPE with 500
 trials; straight, turn, circle and S-curve are fitted, the figure-eight is held out. The table has its four errors per

@@ -1,4 +1,4 @@
-"""The report of a fit: `report.json` (versioned, below), and the tables and the page that people read.
+"""Write the report of a fit: `report.json` (versioned, below), and the tables and the page that people read.
 
 `python -m sysid.report RUN` writes the page RUN/report.html of an earlier fit.
 

@@ -1,4 +1,4 @@
-"""Compares the searches of a fit: error against simulator evaluations and against time.
+"""Compare the searches of a fit: error against simulator evaluations and against time.
 
     python -m sysid.searches DATASET --methods features lm both tpe cmaes --seeds 0 1 2 --out RUN
 

@@ -1,9 +1,11 @@
-"""Most of the suite's time is XLA compiling small programs: none is compiled twice, many with few optimisations."""
+"""Most of the suite's time is XLA compiling small programs: none is compiled twice, most with few optimisations."""
 
+import ctypes
+import gc
 import os
 import signal
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import jax
@@ -18,12 +20,27 @@ os.environ["PYTHONPATH"] = os.pathsep.join([ROOT, *filter(None, [os.environ.get(
 """Commands that tests start are of this tree; other packages stay where they were found."""
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a script; processes of tests need it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+FLAGS = [
+    "--xla_cpu_parallel_codegen_split_count=1",  # the cores have workers of their own
+    # Passes that are repeated until nothing changes, and that few programs of tests run long enough to profit from.
+    "--xla_disable_hlo_passes=simplify-while-loops,while-loop-invariant-code-motion,while-loop-constant-sinking,"
+    "tree_reduction_rewriter",
+]
 if jaxlib.__version__.startswith("0.10."):
     # Half the time to compile; later versions of XLA do not know this flag, and end over one that they do not know.
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+    FLAGS.append("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS]).strip()
+MOST_BYTES = 2_000_000_000
+"""Memory of a worker beyond which it forgets what it has compiled."""
+IN_REAL_TIME = ("bridge",)
+"""Folders whose tests start nodes that must keep their pace."""
 
-QUICK_TO_COMPILE = ("dreamer", "whill_mjx")
-"""Folders whose programs take far longer to compile than to run; those of `sysid` replay many long drives."""
+
+def pytest_collection_finish():
+    """What was imported stays: Python need not look through it for garbage, nor so often through what is traced."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 50)
 
 
 @contextmanager
@@ -71,9 +88,18 @@ def programs():
 
 @pytest.fixture(scope="module", autouse=True)
 def few_optimisations(request):
-    """XLA compiles these folders' programs in about half the time."""
-    if request.path.parent.name not in QUICK_TO_COMPILE:
+    """Programs of most tests take far longer to compile than to run: XLA compiles them in a third of the time."""
+    with options(jax_disable_most_optimizations=request.path.parent.name not in IN_REAL_TIME):
         yield
-        return
-    with options(jax_disable_most_optimizations=True):
-        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def less_memory():
+    """Compiling leaves much memory free that the C library keeps: a worker grew to 6 GB. It is given back."""
+    yield
+    with suppress(OSError, AttributeError):
+        trim = ctypes.CDLL("libc.so.6").malloc_trim
+        trim(0)
+        if int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > MOST_BYTES:
+            jax.clear_caches()
+            trim(0)

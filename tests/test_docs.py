@@ -41,6 +41,13 @@ def test_no_sentence_is_longer_than_35_words(page):
     assert not long, f"{page.name}: {len(long)} sentences of more than {MOST_WORDS} words. Split them: {long[0]!r}"
 
 
+@pytest.mark.parametrize("page", DOCS, ids=str)
+def test_a_page_begins_with_a_sentence_and_not_with_code(page):
+    """Or with a table, which a glossary is."""
+    _, *blocks = [block for block in page.read_text().split("\n\n") if not block.startswith("<!--")]
+    assert not blocks[0].startswith(("```", "![")), f"{page.name}: say first what the page is for."
+
+
 @pytest.mark.parametrize("page", PAGES, ids=str)
 def test_links_between_pages_lead_somewhere(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
@@ -166,6 +173,13 @@ def test_pages_that_are_made_are_up_to_date():
             f"A new task also needs its picture (... picture --tasks {name}) and a line in mkdocs.yml and index.md.")
 
 
+def test_each_command_says_what_it_does_by_a_verb():
+    from benchmarks import command_page
+
+    said = re.findall(r"^\| \[`python -m .*\| (\w+) ", command_page.page(), re.MULTILINE)
+    assert len(said) > 20 and not [word for word in said if word in ("A", "An", "The") or word.endswith("s")]
+
+
 def test_links_of_the_repository_become_links_of_the_site():
     spec = importlib.util.spec_from_file_location("site_hooks", ROOT / "docs" / "site_hooks.py")
     hooks = importlib.util.module_from_spec(spec)
@@ -186,3 +200,10 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     text = (tmp_path / "site" / "api" / "whill_mjx.html").read_text()
     assert "make_batch" in text and "Args" not in (tmp_path / "site" / "index.html").read_text()
+
+
+def test_the_first_hour_is_timed_with_the_commands_of_readme():
+    from benchmarks.first_hour import PARTS
+
+    readme = re.sub(r" *#.*", "", (ROOT / "README.md").read_text())
+    assert all(line in readme.splitlines() for lines in PARTS.values() for line in lines)

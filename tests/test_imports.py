@@ -18,7 +18,7 @@ PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
 ALLOWED = {"whill_mjx": set(), "sysid": {"whill_mjx"}, "dreamer": set(), "bridge": set()}
 DOORS = {
     "whill_mjx/train.py": {"dreamer", "sysid"},  # the training command
-    "bridge/simulate.py": {"whill_mjx"},  # the simulator behind the topics
+    "bridge/simulate.py": {"whill_mjx", "sysid"},  # the simulator, or a robot file, behind the topics
 }
 ROOMS = {"whill_mjx/learning": {"dreamer"}}  # belongs to the first
 

@@ -145,3 +145,14 @@ def test_pins_of_several_pythons_become_one_list():
     text = merged({"3.12": {"a": "2", "b": "1", "c": "3"}, "3.11": {"a": "1", "b": "1"}, "3.13": {"a": "2", "b": "1",
                                                                                                 "c": "3"}})  # fmt: skip
     assert text.splitlines()[1:] == ["a==1; python_version < '3.12'", "a==2; python_version >= '3.12'", "b==1", "c==3"]
+
+
+def test_readme_of_a_release_leads_to_pictures_and_pages_from_anywhere():
+    ready = runpy.run_path(str(ROOT / ".ci" / "index_readme.py"))
+    url, readme = "https://a.b/c", (ROOT / "README.md").read_text()
+    text = ready["absolute"](readme, url, "v1.2.3")
+    assert f"]({url}/raw/v1.2.3/docs/images/drive.webp)" in text and f"]({url}/blob/v1.2.3/docs/fit.md)" in text
+    assert not re.findall(r"\]\((?!https?://)[^)\s]+\)", text)
+    project = tomllib.loads(ready["with_urls"]((ROOT / "pyproject.toml").read_text(), url))["project"]
+    assert project["urls"]["Issues"] == f"{url}/issues"
+    assert {**project, "urls": None} == {**PROJECT["project"], "urls": None}

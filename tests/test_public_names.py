@@ -15,8 +15,9 @@ PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge", "bridge.policy")
 ARRAY = re.compile(r"\b(Array|ndarray)\b")
 SHAPE = re.compile(r"\((?:\.\.\.|[\w+* ]*)(?:, ?(?:\.\.\.|[\w+* ]+))*,?\)")
 """Such as (), (2,), (T, 5) or (H, W, C)."""
-UNIT = re.compile(r"\[[^\]]+\]|\b(m|s|m/s|rad|rad/s|kg|N|Hz|SI|uint8|int32|bool|pixels|normalised|units?|share|nat)\b")
-"""A unit, or a word for what has none."""
+WORDS = "m|s|m/s|rad|rad/s|kg|Hz|SI|uint8|int32|bool|pixels|normalised|units?|share|nat"
+UNIT = re.compile(rf"\[[^\]]+\]|(?<!')\b({WORDS})\b")
+"""A unit, or a word for what has none; no possessive s, and no N, which counts instances."""
 
 pytestmark = pytest.mark.quick
 

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import tables
 from benchmarks.claims import Claim
+from benchmarks.claims.fits import _ladder
 from benchmarks.harness import RESULTS, figure, record
 from benchmarks.merge import merge
 from benchmarks.tables import MARKS, headlines, page, put_between_marks, shown
@@ -66,6 +67,13 @@ def test_every_claim_and_headline_names_figures_that_were_recorded():
         assert figures.fill(value, stem), what
 
 
+def test_the_ladder_has_a_row_for_each_rung_whatever_was_named():
+    rungs = ("ideal", "base", "with_1_pose_delay", "with_2_supply_sag_quadratic_drag")
+    rows = _ladder({"figures": {f"ladder_all_position_{rung}": {} for rung in rungs}})
+    assert [row[0] for row in rows[:-1]] == [
+        "ideal replay", "fitted base", "with `pose_delay`", "with `supply_sag`, `quadratic_drag`"]
+
+
 def test_readme_has_at_most_ten_figures_and_both_pages_agree_with_the_result_files():
     assert len(tables.HEADLINES) <= 10
     for path, text in tables.pages().items():
@@ -73,11 +81,17 @@ def test_readme_has_at_most_ten_figures_and_both_pages_agree_with_the_result_fil
 
 
 def test_a_figure_of_another_release_is_marked_as_older(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "HEADLINES", (("camera", "a run", "{dt_s} s"),))
-    path = record("camera", "it runs", {"dt_s": figure([1.0], "s", "x")}, tmp_path)
-    assert "| a run | 1 s | x |" in headlines(tmp_path)
+    lines = ("camera", "a run", "{dt_s} s"), ("camera", "a race", "{dt_s} s (others: {peer_s} s)")
+    monkeypatch.setattr(tables, "HEADLINES", lines)
+    figures = {name: figure([1.0], "s", "x") for name in ("dt_s", "peer_s")}
+    path = record("camera", "it runs", figures, tmp_path)
+    assert "| a run | 1 s | x |" in headlines(tmp_path) and "*" not in headlines(tmp_path)
+    content = json.loads(path.read_text())
+    content["figures"]["peer_s"]["release"] = "0.0.1"
+    path.write_text(json.dumps(content))
+    assert "| a run | 1 s | x |\n| a race | 1 s (others: 1* s) | x |\n\nFigures with *" in headlines(tmp_path)
     path.write_text(path.read_text().replace(f'"release": "{__version__}"', '"release": "0.0.1"'))
-    assert "| a run | 1 s* | x |" in headlines(tmp_path)
+    assert "| a run | 1 s* | x |\n| a race | 1 s (others: 1 s)* | x |\n\nFigures with *" in headlines(tmp_path)
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--check"]])

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from whill_mjx.evaluation.policy_file import load_policy as load_policy
     from whill_mjx.gym import WhillEnv as WhillEnv
     from whill_mjx.gym.vector import WhillVectorEnv as WhillVectorEnv
+    from whill_mjx.processor import device_per_core as device_per_core
     from whill_mjx.processor import share_results as share_results
     from whill_mjx.tasks.tasks import Budget as Budget
     from whill_mjx.tasks.tasks import Corridor as Corridor
@@ -63,6 +64,7 @@ _HOMES = {
     "share_results": "whill_mjx.processor",
 }
 _EXTENDING = {
+    "device_per_core": "whill_mjx.processor",
     "Task": "whill_mjx.tasks.tasks",
     "World": "whill_mjx.tasks.tasks",
     "Budget": "whill_mjx.tasks.tasks",

@@ -1,4 +1,4 @@
-"""Drives manoeuvres with a simulated vehicle and writes them as a driving-log dataset.
+"""Drive manoeuvres with a simulated vehicle and write them as a driving-log dataset.
 
     python -m whill_mjx.drive --manoeuvre figure_eight --vehicle whill_cr_physical \
         --effects command_delay:delay=0.2 yaw_scrub:torque=6 --replicates 3 --noise --out DATASET

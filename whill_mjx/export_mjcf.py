@@ -1,4 +1,4 @@
-"""A vehicle for C MuJoCo: an MJCF file of its rigid bodies, and a callback that evaluates its forces.
+"""Export a vehicle to C MuJoCo: an MJCF file of its rigid bodies, and a callback that evaluates its forces.
 
     python -m whill_mjx.export_mjcf VEHICLE --out DIR
 

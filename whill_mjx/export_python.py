@@ -1,4 +1,4 @@
-"""A vehicle as one stand-alone Python file: its step, with all its effects, in numpy alone.
+"""Export a vehicle as one stand-alone Python file: its step, with all its effects, in numpy alone.
 
     python -m whill_mjx.export_python VEHICLE --out vehicle.py
 

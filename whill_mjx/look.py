@@ -1,4 +1,4 @@
-"""Pictures of scenes: `python -m whill_mjx.look --scene obstacle_course --out FILE.png`, or FILE.mp4 for a video.
+"""Draw tasks and scenes as pictures or videos: `python -m whill_mjx.look --scene obstacle_course --out FILE.png`.
 
 A task has one column per world: what the camera sees at the start, what it sees halfway, and the world from above;
 its video shows a planner driving. The gallery shows all that the camera can draw: plain, at its best, with lens and

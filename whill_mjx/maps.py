@@ -1,4 +1,4 @@
-"""Make a scene of a map and show what came of it: `python -m whill_mjx.maps FILE --out scene`."""
+"""Turn a map into a scene and draw it from above: `python -m whill_mjx.maps FILE --out scene`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The main job: fit the vehicle to a driving log, train a policy in its simulator, evaluate it and export it.
+"""Fit the vehicle to a driving log, train a policy in its simulator, evaluate it and export it.
 
     python -m whill_mjx.train --out RUN [--vehicle FIT/vehicle.toml] [--task obstacle_course] [--preset auto]
 
@@ -140,7 +140,7 @@ def finish(
     baselines = [name for name in ("planner", "random") if name in evaluation]
     others = ", ".join(f"{name} {evaluation[name]['success']:.0%}" for name in baselines)
     say(
-        f"success {share:.0%} (95 % interval {interval[0]:.0%} to {interval[1]:.0%}), {others}; policy file {policy}; "
+        f"success {share:.0%} (95% interval {interval[0]:.0%} to {interval[1]:.0%}), {others}; policy file {policy}; "
         f"{seconds / 60:.1f} min"
     )
     for line in list_results(options.out):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from benchmarks.claims.claim import Claim, Row
@@ -33,16 +34,46 @@ def _coverage(content: dict[str, Any]) -> list[Row]:
     ]
 
 
-def _ladder(terrain: str) -> Row:
-    return (
-        terrain,
-        f"{{ladder_{terrain}_position_ideal}}",
-        f"{{ladder_{terrain}_position_base}}",
-        f"{{ladder_{terrain}_position_with_1_pose_delay}}",
-        f"{{ladder_{terrain}_position_with_2_acceleration_limit_supply_sag_quadratic_drag}}",
-        f"{{ladder_gain_{terrain}_position|%}}",
-        f"{{ladder_gain_{terrain}_position_low|%}} to {{ladder_gain_{terrain}_position_high|%}}",
-    )
+EFFECTS = Path(__file__).parents[2] / "whill_mjx" / "effects"
+PEERS = (
+    ("ideal replay", "peer_ideal"),
+    ("scales, lag, delay (4 numbers)", "peer_4_numbers"),
+    ("and a limit of the wheels' speed (5)", "peer_5_numbers"),
+    ("and a late pose, sideways slip (7)", "peer_7_numbers"),
+    ("and a lag of turning (8)", "peer_8_numbers"),
+    ("the publishers' powertrain and slip model", "peer_published"),
+    ("a network beside the 8 numbers", "peer_network"),
+)
+
+
+def _ladder(content: dict[str, Any]) -> list[Row]:
+    """One row for each rung, whatever the loop named."""
+    first = "ladder_all_position_"
+    rungs = [name.removeprefix(first) for name in content["figures"] if name.startswith(first)]
+    rows: list[Row] = []
+    for rung in rungs:
+        alone = f"ladder_alone_all_position_{rung}"
+        known = alone in content["figures"]
+        rows.append((_of_rung(rung), *(f"{{ladder_{where}_{rung}}}" for where in (
+            "all_position", "all_yaw", "asphalt_position", "gravel_position", "sand_position")),
+            f"{{{alone}|%}} ({{{alone}_low|%}} to {{{alone}_high|%}})" if known else "-"))
+    gains = [f"ladder_gain_{where}" for where in (
+        "all_position", "all_yaw", "asphalt_position", "gravel_position", "sand_position")]
+    return [*rows, ("less than the base", *(f"{{{gain}|%}} ({{{gain}_low|%}} to {{{gain}_high|%}})" for gain in gains),
+                    "-")]
+
+
+def _of_rung(rung: str) -> str:
+    """The effects in the name of a rung, with_NUMBER_EFFECT_EFFECT, in words."""
+    if not rung.startswith("with_"):
+        return {"ideal": "ideal replay", "base": "fitted base"}.get(rung, rung)
+    rest, found = rung.split("_", 2)[2], []
+    known = sorted((path.stem for path in EFFECTS.glob("*.py")), key=len, reverse=True)
+    while rest:
+        name = next((one for one in known if rest == one or rest.startswith(f"{one}_")), rest)
+        found.append(f"`{name}`")
+        rest = rest.removeprefix(name).removeprefix("_")
+    return f"with {', '.join(found)}"
 
 
 def _changed(run: str) -> Row:
@@ -200,12 +231,20 @@ CLAIMS = (
         MEASURED,
         "DRIVE: what the missing effects gain",
         "measured",
-        "Held-out position error [m] after 6 s of ideal replay, of the fitted base, with the late pose "
-        "(`pose_delay`), and with a ramp of the command, a sagging supply and drag beside it. The loop named these "
-        "one after the other. The gain is over the fitted base, with its 95 % interval. A network that knows only "
-        "the commands: {peer_network_position} m.",
-        ("terrain", "ideal", "base", "with the late pose", "with all four", "gain", "interval"),
-        tuple(_ladder(terrain) for terrain in ("all", "asphalt", "gravel", "sand")),
+        "Held-out error over 6 s of ideal replay, of the fitted base, and with the effects that the loop named one "
+        "after the other. Each row has those of the rows before it. In the last column nothing moved but what was "
+        "named; the rest is gained by base parameters that were fitted beside it. Intervals are of 95 %.",
+        ("vehicle", "position [m]", "yaw [rad]", "asphalt [m]", "gravel [m]", "sand [m]", "gained by the named alone"),
+        _ladder,
+    ),
+    Claim(
+        MEASURED,
+        "DRIVE: what models of the commands alone predict",
+        "measured",
+        "The same steps, predicted by models that know nothing of the vehicle. All are written anew from "
+        "their descriptions.",
+        ("model", "position [m]", "yaw [rad]"),
+        tuple((label, f"{{{stem}_position}}", f"{{{stem}_yaw}}") for label, stem in PEERS),
     ),
     Claim(
         MEASURED,
@@ -216,6 +255,18 @@ CLAIMS = (
         "Gyro and wheels named the change in all three runs.",
         ("run", "as on asphalt", "on its floor", "gain, position", "gain, yaw"),
         tuple(_changed(run) for run in ("gravel", "sand_1", "sand_2")),
+    ),
+    Claim(
+        MEASURED,
+        "DRIVE: halves of one run",
+        "measured",
+        "Halves of the asphalt run against one another, of which nothing differs: how often something is named all the "
+        "same. Each cut begins at another tenth of the run.",
+        ("asked", "false names", "cuts"),
+        (
+            ("gyro and wheels, whether the floor is another one", "{floor_false_asphalt}", "10"),
+            ("the whole loop, what is missing", "{half_false}", "{half_cuts}"),
+        ),
     ),
     Claim(
         MEASURED,

@@ -276,7 +276,8 @@ def _is_half_character(text: str) -> bool:
 
 
 def read_arrays(name: str, data: bytes) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz by name, each of the shape (...) that it was stored with; `name` is the file.
+    """Return the arrays of an .npz by name, each of the shape (...) and type that it was stored with, such as
+    float32 without a unit; `name` is the file.
 
     Raises:
         PolicyFileError: it is no archive of plain arrays, or an array's header says another size than its bytes have.

@@ -46,6 +46,7 @@ STREAM_WORDS = {
     "ground_truth": ("gt", "truth", "groundtruth", "mocap", "vicon", "optitrack", "qualisys", "icp", "slam", "amcl",
                      "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum"),
 }
+STREAM_LAST = {word for words in STREAM_WORDS.values() for word in words}
 QUANTITY_WORDS = {
     "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi", "kurs", "gierwinkel"),
     "qx": ("qx",), "qy": ("qy",), "qz": ("qz",), "qw": ("qw",),
@@ -284,6 +285,9 @@ def _split_unit(name: str) -> tuple[str, str]:
     """Name without its unit, and the unit; empty where none is written."""
     if match := re.search(r"[\[(<]\s*([^\])>]+)\s*[\])>]\s*$", name):
         return name[: match.start()], _unit(match[1])
+    rest, gap, last = re.match(r"(.*?)([_ .]?)([^_ .]*)$", name, re.DOTALL).groups()  # type: ignore[union-attr]
+    if gap and last.lower() in STREAM_LAST and (split := _split_unit(rest))[1]:  # left_rpm_cmd
+        return f"{split[0]}{gap}{last}", split[1]
     if match := re.search(r"[_ .]((?:k?m|mm|cm|rad|deg)[_ ]?(?:p|per|/)[_ ]?(?:s|h|sec)|kmh|kph|mps|mmps|rpm|degrees|"
                           r"radians|degs|dps|rads|deg|rad|mm|cm|ms|us|ns|msec|usec|nanos|millis|secs|sec|seconds)$",
                           name, re.IGNORECASE):
@@ -405,10 +409,11 @@ class _Known:
 
     def heading(self, stream: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Times [s] and heading [rad] of a pose, without jumps."""
-        parts = [part for one in ("qw", "qx", "qy", "qz") if (part := self.signal(f"{stream}.{one}"))]
-        if len(parts) == 4 and len({len(part[0]) for part in parts}) == 1:
-            w, x, y, z = (part[1] for part in parts)
-            return parts[0][0], np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
+        parts = {one: part for one in ("qw", "qx", "qy", "qz") if (part := self.signal(f"{stream}.{one}"))}
+        if {"qw", "qz"} <= set(parts) and len({len(part[0]) for part in parts.values()}) == 1:
+            t, w = parts["qw"]
+            x, y, z = (parts[one][1] if one in parts else np.zeros(len(t)) for one in ("qx", "qy", "qz"))
+            return t, np.unwrap(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
         yaw = self.signal(f"{stream}.yaw")
         return (yaw[0], np.unwrap(yaw[1])) if yaw else None
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.logs.pose_jumps import constant_columns, jumps
 from sysid.logs.records import Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
@@ -27,8 +28,6 @@ BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
 REACH, LAG_DT = 10.0, 0.1  # s of a clock that is looked for, and its steps
 LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
 UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
-JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step of the pose that is a reset
-FEW = 3  # resets of one drive; more steps are noise
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
 PLAINER = 0.1  # share of the motion that another explanation must explain more of
@@ -55,6 +54,10 @@ class Direction:
     error: float
     explained: float
     """Share of the motion that this explains."""
+    gain: float = 1.0
+    """Speed of the pose over the one it should have."""
+    gain_error: float = 0.0
+    """Infinite where the tracked point would be too far off."""
 
 
 def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
@@ -68,7 +71,8 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
 
 
 def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
-    if name == "odometry" and (found := [*_resets(trials), *_empty_speeds(trials)]):
+    empty = _empty_speeds(trials) if name == "odometry" else []
+    if found := [*jumps(name, trials), *empty, *constant_columns(name, trials)]:
         return found
     if said := another_clock(name, trials):
         return [said]
@@ -152,7 +156,8 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
     along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)
     design = np.column_stack([motion.v, motion.omega])
     gains = np.linalg.lstsq(design, along, rcond=None)[0]
-    if abs(gains[1]) > reach:
+    too_far = abs(gains[1]) > reach
+    if too_far:
         gains[1] *= reach / abs(gains[1])
         gains[0] = motion.v @ (along - gains[1] * motion.omega) / max(motion.v @ motion.v, 1e-12)
     left = along - design @ gains
@@ -161,8 +166,10 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
     # What v alone shows: on a circle a turned axis and a point before the axle move alike.
     alone = motion.v - motion.omega * (motion.v @ motion.omega) / max(motion.omega @ motion.omega, 1e-12)
     independent = max(len(left) * GRID_DT / APART, 1.0)  # samples
-    error = np.sqrt(np.mean(np.square(left.imag)) / independent / max(np.mean(np.square(alone)), 1e-12))
-    return Direction(float(np.angle(gains[0])), float(error / max(abs(gains[0]), 1e-9)), explained)
+    power_alone, size = independent * max(float(np.mean(np.square(alone))), 1e-12), float(abs(gains[0]))
+    across, ahead = (float(np.sqrt(np.mean(np.square(one)) / power_alone)) for one in (left.imag, left.real))
+    return Direction(float(np.angle(gains[0])), across / max(size, 1e-9), explained, size,
+                     float("inf") if too_far else ahead)
 
 
 def _in_fixed_frame(motions: Sequence[Motion]) -> bool:
@@ -186,7 +193,7 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
     """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
     explains what nothing else does; None otherwise.
 
-    Rates of turning are compared, or of motion where there is no turn: no frame changes them.
+    Rates of turning and of motion are compared: no frame changes them.
 
     Args:
         beside: compare with the commands, though there are measured speeds.
@@ -209,9 +216,10 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
              if min(ours.std(), theirs.std()) > VARIED]
     if not pairs:
         return None
-    ours, theirs = pairs[0]
     most = min(round(REACH / LAG_DT), len(t) - 1)
-    alike = np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)])
+    # A skid drive turns late and little, a circle has one speed: the pair that fits best shows the clock.
+    alike = max((np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)]) for ours, theirs in pairs),
+                key=np.max)
     now, k = float(alike[most]), int(np.argmax(alike))
     bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
     late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
@@ -225,35 +233,6 @@ def _overlap(ours: np.ndarray, theirs: np.ndarray, lag: int) -> float:
     """Likeness of rates (T,) with others (T,) that come so many rows earlier; outside of them nothing moves."""
     one, other = ours[max(lag, 0) : len(ours) + min(lag, 0)], theirs[max(-lag, 0) : len(theirs) - max(lag, 0)]
     return float(one @ other) / max(float(np.sqrt((ours @ ours) * (theirs @ theirs))), 1e-9)
-
-
-def _resets(trials: Sequence[Trial]) -> list[str]:
-    """Steps of the odometry's pose that its speeds do not allow."""
-    found = []
-    for trial in trials:
-        stream = trial.odometry
-        if stream is None or stream.x is None or stream.y is None or len(stream.t) < 20:
-            continue
-        dt = np.diff(stream.t)
-        steps = [np.hypot(np.diff(stream.x), np.diff(stream.y))]
-        steps += [] if stream.yaw is None else [np.abs(np.diff(stream.yaw))]
-        jumps = np.zeros(len(dt), bool)
-        for step, speed in zip(steps, (stream.v, stream.omega), strict=False):
-            way = np.maximum(np.abs(speed[1:]), np.abs(speed[:-1])) * dt
-            way = np.max([np.roll(way, shift) for shift in (-2, -1, 0, 1, 2)], axis=0)  # rows held up catch up at once
-            usual = float(np.percentile(step / dt, 95)) * dt
-            jumps |= step > JUMP[0] + JUMP[1] * np.maximum(way, usual)
-        at = np.flatnonzero(jumps)
-        if 0 < len(at) <= FEW:
-            sizes = [f"{step[at[0]]:.2f} {unit}" for step, unit in zip(steps, ("m", "rad"), strict=False)
-                     if step[at[0]] > JUMP[0]]
-            found.append((trial.name, float(stream.t[at[0] + 1]), " and ".join(sizes)))
-    if not found:
-        return []
-    name, at_time, size = found[0]
-    return [f"odometry: in {len(found)} of {len(trials)} trials ({name}, at {at_time:.1f} s) its pose jumps by "
-            f"{size} from one row to the next, which its speeds do not: it was reset there. Split the trial "
-            "there."]
 
 
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:

@@ -23,7 +23,7 @@ from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, rea
 from sysid.logs.sources import is_lerobot
 from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
 from whill_mjx.io.command_line import WRITING, Range
-from whill_mjx.io.fields import COLUMNS
+from whill_mjx.io.fields import COLUMNS, counted
 from whill_mjx.io.folders import unfinished
 from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
 from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
@@ -142,6 +142,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     elif bags:
         spec = _spec(config)
         drives, notes, wheels = _any_drives(bags, config, spec)
+        notes += _tables_beside(config.source)
         if wheels:
             more["input"] = "wheels"
     else:
@@ -166,6 +167,13 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
+
+
+def _tables_beside(source: Path) -> list[str]:
+    """A note on tables in a folder of bags, which are not read."""
+    loose = [one for drive in text_files(source) for one in drive if one.suffix.lower() != ".txt"]
+    return [f"left out: {counted(len(loose), 'table')} beside the bags ({loose[0]}). Convert tables by themselves"
+            ] if loose else []
 
 
 def _any_drives(

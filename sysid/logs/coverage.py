@@ -10,14 +10,19 @@ import numpy as np
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.records import Log, Trial, command_in_force
+from sysid.logs.records import Command, Log, Trial, command_in_force
 from sysid.logs.standing import said, stood
+from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
-from sysid.logs.time_faults import time_faults, uncommanded
+from sysid.logs.time_faults import pauses, time_faults, uncommanded
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
 SLOW_SECONDS = 1.0  # s of such commands that are enough
+ALIKE = 0.7  # correlation of a speed with a command that it follows
+SHORTEST = 6.0  # s of a trial in which clocks can be compared
+CHECK = "Check the log: "
+"""Begins what a fit says of a fault."""
 LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
 CLOSELY = 0.8  # correlation with the command at a usual delay that needs no search for a better one
 SETTLED = 1.0  # s after which a vehicle has reached what it makes of a constant command
@@ -121,13 +126,27 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
     Args:
         responses: `response_shift` of every trial by channel, where it is known.
     """
-    trials, skid = log.trials, log.spec.drive == "skid"
-    standing = stood(trials, log.spec.track / 2)
+    standing = stood(log.trials, log.spec.track / 2)
     if standing:
         found = [f"{said(standing)}. A fit leaves such trials out."]
-        trials = tuple(trial for trial in trials if trial.name not in standing)
-        return found + sanity(replace(log, trials=trials)) if trials else found
-    found = []
+        moved = replace(log, trials=tuple(trial for trial in log.trials if trial.name not in standing))
+        return found + sanity(moved) if moved.trials else found
+    found = faults(log, responses)
+    if not found:  # a wrong frame, unit or clock shows no size
+        found += wrong_sizes(log.trials, log.spec, max(log.spec.track, LEAST_REACH))
+    return [*found, *pauses(log.trials)]
+
+
+def doubts(log: Log) -> list[str]:
+    """What a fit and a closed loop say first of a log: faults of it that they do not take care of."""
+    long = tuple(trial for trial in log.trials if trial.duration >= SHORTEST)
+    return [f"{CHECK}{one}" for one in faults(replace(log, trials=long))] if long else []
+
+
+def faults(log: Log, responses: Responses | None = None) -> list[str]:
+    """Of what `sanity` says, units, signs, frames and times that are wrong."""
+    trials, skid = log.trials, log.spec.drive == "skid"
+    found: list[str] = []
     cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
@@ -147,6 +166,9 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
             if odd and abs(follows) < FOLLOWS:
                 seen.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
+            elif gain < 0 and channel == "ground_truth" and name == "v":
+                seen.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add pi to "
+                            "yaw, or negate the commands' v, whichever is wrong.")
             elif gain < 0:
                 seen.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
                              f"and yaw; negate it.")
@@ -156,8 +178,8 @@ def sanity(log: Log, responses: Responses | None = None) -> list[str]:
             elif odd:
                 seen.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
-        late = another_clock(channel, trials, "commands") if seen else ""
-        found += [late] if late else seen  # such a log shows neither sign nor unit
+        other = (another_clock(channel, trials, "commands") or _exchanged(channel, trials)) if seen else ""
+        found += [other] if other else seen  # such a log shows neither sign nor unit
         lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
         ratios = [ours / commanded for ours, commanded in lengths if commanded > 1.0 and np.isfinite(ours)]
         if ratios and not 0.3 < np.median(ratios) < 3.0:
@@ -200,6 +222,17 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
     measured = rates[index] - rates[index].mean()
     norm = np.sqrt((centred @ centred) * (measured @ measured))
     return float(centred @ measured / (centred @ centred)), float(centred @ measured / norm) if norm > 1e-12 else 0.0
+
+
+def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
+    """A sentence where the measured speed follows the commanded yaw rate and the other way round; else empty."""
+    other = [replace(one, command=Command(one.command.t, one.command.omega, one.command.v)) for one in trials]
+    for index in (1, 2):
+        follows = [gain[1] for one in other if (gain := _gain(one, channel, index)) is not None]
+        if not follows or np.median(follows) < ALIKE:
+            return ""
+    return (f"command: the speed that {channel} shows follows omega, and its yaw rate follows v: the two columns are "
+            "exchanged.")
 
 
 def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import io
 import warnings
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.command_timeout import with_own_timeout
-from sysid.logs.gyro import told_sign
+from sysid.logs.gyro import told_sign, with_sign
 from sysid.logs.log import hash_files, load_log
 from sysid.logs.lost_pose import without_lost
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
@@ -44,7 +45,9 @@ MAX_NANOSECONDS = 86_400 * 10**9
 CONTINUOUS_COLUMNS = (
     *(f"icp_quat_{axis}" for axis in "xyzw"), "icp_pos_x", "icp_pos_y", "meas_left_vel", "meas_right_vel", "cmd_vel_x",
     "cmd_vel_omega")
+YAW_RATE = "imu_z"  # of a continuous log
 LARGEST = 1e6  # m, rad or rad/s that a measured value stays below
+DRIVE_ENDS = (".npz", ".csv", ".csv.gz")
 CONVERT = "Convert the original again"
 ORIGINAL = "Use the original file."
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
@@ -56,6 +59,7 @@ BREAK = 0.5
 """Probability of a lost update from which the motion over a joint is not compared bin by bin."""
 HELD = 1e-9
 """Difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample."""
+ROBOTS = ("robot1", "robot2", "robot3", "robot4", "robot5")
 MRCLAM_WINDOW = 15.0  # s
 MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
 START_SPAN = 0.15
@@ -83,6 +87,19 @@ def mrclam_files(folder: Path, robot: str, kind: str) -> list[Path]:
     return sorted(path for end in ("", ".gz") for path in folder.glob(f"*Robot{robot}_{kind}.dat{end}"))
 
 
+def mrclam_robots(keys: Sequence[str]) -> tuple[int, ...]:
+    """Numbers of the robots that selections name: robot1 or one of its trials.
+
+    Raises:
+        ValueError: one names none.
+    """
+    robots = [key.split("/")[0] for key in keys]
+    for key, robot in zip(keys, robots, strict=True):
+        if robot not in ROBOTS:
+            raise ValueError(f"selection {key!r}: MRCLAM has robot1 to robot5. Give one of them.")
+    return tuple(dict.fromkeys(ROBOTS.index(robot) + 1 for robot in robots))
+
+
 def is_known(path: Path) -> bool:
     """Whether a folder is a dataset or a measured set."""
     try:
@@ -92,9 +109,31 @@ def is_known(path: Path) -> bool:
 
 
 def drive_spec(run: str) -> VehicleSpec:
-    """Nominal geometry of the robot that drove `run` (the constants and their sources are in
-    whill_mjx.vehicle.specs)."""
-    return HUSKY if run.startswith("husky") else WARTHOG
+    """Nominal geometry of the robot that drove `run`, a Warthog unless its name says otherwise (the constants and their
+    sources are in whill_mjx.vehicle.specs)."""
+    return HUSKY if HUSKY.name in run else WARTHOG
+
+
+def drive_files(folder: Path) -> dict[str, Path]:
+    """Run -> file of the DRIVE runs in a folder."""
+    return {path.name.split(".")[0]: path for path in sorted(folder.glob("*")) if path.name.endswith(DRIVE_ENDS)}
+
+
+def drive_selection(folder: Path, keys: Sequence[str]) -> tuple[str, ...]:
+    """Runs that selections name: RUN, one of its trials, or GROUP.
+
+    Raises:
+        FileNotFoundError: one names none.
+    """
+    runs = drive_files(folder)
+    chosen: list[str] = []
+    for key in keys:
+        found = [run for run in runs if key.split("/")[0] == run or key == drive_group(run)]
+        if not found:
+            known = sorted({*runs, *map(drive_group, runs)})
+            raise FileNotFoundError(f"{folder}: no run {key!r} (known: {', '.join(known)}).")
+        chosen += found
+    return tuple(dict.fromkeys(chosen))
 
 
 def drive_group(run: str) -> str:
@@ -107,7 +146,7 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
 
     Args:
         folder: folder with the .npz and .csv.gz files.
-        runs: file stems, e.g. ("warthog_sand_1",).
+        runs: file stems, or groups of them, e.g. ("warthog_sand_1",).
         chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the motion
             is then that of wheels and gyro, by its probability, and the note on the log states how often and how much.
 
@@ -117,6 +156,7 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
         `fields["pose_stamps"]` is "receipt": how old a pose is at its stamp is not known.
     """
     folder = Path(folder)
+    runs, files = drive_selection(folder, runs), drive_files(folder)
     specs = {drive_spec(run) for run in runs}
     if len(specs) != 1:
         raise ValueError(f"{folder}: runs {runs} are of {len(specs)} different robots; fit one robot at a time.")
@@ -124,15 +164,15 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
     notes = []
     gyro: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for run in runs:
-        found = sorted(folder.glob(f"{run}.*"))
-        if not found:
-            known = sorted(path.name.split(".")[0] for path in folder.glob("warthog*")) + ["husky_steps_000_133"]
-            raise FileNotFoundError(f"{folder}: no run {run!r} (known: {', '.join(known)}).")
-        if found[0].suffix == ".npz":
-            run_trials, note, run_gyro = _drive_windows(found[0], run, chained)
+        if files[run].suffix == ".npz":
+            run_trials, note, run_gyro = _drive_windows(files[run], run, chained)
             gyro.update(run_gyro)
         else:
-            run_trials, note = _drive_continuous(found[0], run, 6.0 if chained else 2.0)
+            run_trials, note = _drive_continuous(files[run], run, 6.0 if chained else 2.0)
+            gyro.update({one.name: (one.gyro.t, np.gradient(one.gyro.turn, one.gyro.t)) for one in run_trials
+                         if one.gyro is not None})
+        if not any(spec.name in run for spec in (HUSKY, WARTHOG)):
+            note += "; its name has no robot: it is taken for a Warthog"
         trials += run_trials
         notes.append(note)
     return Log("drive_norlab", specs.pop(), tuple(trials), hash_files(folder), tuple(notes),
@@ -338,6 +378,7 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
     x, y = column("icp_pos_x"), column("icp_pos_y")
     wheel_v, wheel_omega = twist_from_wheels(spec, column("meas_left_vel"), column("meas_right_vel"))
     command_v, command_omega = column("cmd_vel_x"), column("cmd_vel_omega")
+    turning = column(YAW_RATE) if YAW_RATE in columns else np.full(len(t), np.nan)
     finite = np.isfinite([x, y, yaw, wheel_v, wheel_omega, command_v, command_omega]).all(axis=0)
     trials = []
     for number, begin in enumerate(np.arange(0.0, t[-1] - window, window)):
@@ -354,8 +395,12 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
         command = Command(now, command_v[inside], command_omega[inside])
         odometry = OdometryStream(now, None, None, None, wheel_v[inside], wheel_omega[inside])
         start = Start(v=float(wheel_v[first]), omega=float(wheel_omega[first]), measured=True)
-        trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run)))
-    return trials, f"{run}: {len(trials)} windows of {window:g} s during calibration phases"
+        gyro = GyroStream.of_rates(now, turning[inside]) if np.isfinite(turning[inside]).all() else None
+        trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run),
+                            gyro=gyro))
+    told, said = with_sign(trials)
+    note = "; ".join([f"{run}: {len(trials)} windows of {window:g} s during calibration phases", *said])
+    return list(told), note
 
 
 def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
@@ -369,7 +414,7 @@ def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
         if name not in header:
             raise ValueError(f"{path}: no column {name!r} (found {shown(sorted(header))}). {CONVERT}.")
     index = {name: header.index(name) for name in header}
-    columns: dict[str, array] = {name: array("d") for name in CONTINUOUS_COLUMNS}
+    columns: dict[str, array] = {name: array("d") for name in (*CONTINUOUS_COLUMNS, YAW_RATE) if name in index}
     times, states = [], []
     for number, (line, row) in enumerate(rows):
         if len(row) != len(header):
@@ -503,7 +548,11 @@ def _selected(log: Log, selection: str) -> list[str]:
     except ValueError:
         raise ValueError(f"selection {selection!r}: {share!r} must be FROM-TO, shares of the run, e.g. 0-0.667."
                          ) from None
-    return [name for i, name in enumerate(names) if low <= i / len(names) < high]
+    chosen = [name for i, name in enumerate(names) if low <= i / len(names) < high]
+    if not chosen:
+        raise ValueError(f"selection {selection!r}: no trial of {len(names)} lies there. Give shares FROM-TO of 0 to "
+                         "1, the smaller one first.")
+    return chosen
 
 
 def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), held_out: tuple[str, ...] = (),
@@ -519,18 +568,17 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
         raise ValueError(f"{path}: its dataset.toml says which trials are held out. Give --train beside --held-out "
                          "to choose both here, or leave --held-out out.")
     if form == "dataset":
-        log: Log = with_own_timeout(_without_held(load_log(path)))
-        return in_windows(without_standing(split(log, train, held_out) if train else log, str(path)))
+        log: Log = in_windows(with_own_timeout(_without_held(load_log(path))))
+        return without_standing(split(log, train, held_out) if train else log, str(path))
     if not train:
         raise ValueError(f"{path}: a {form} set does not say which trials to fit. Give --train, for example "
                          + ("warthog_sand_1" if form == "drive_norlab" else "robot1 robot2 robot3")
                          + ", and --held-out.")
     keys: list[Any] = [selection.partition(":")[0] for selection in (*train, *held_out)]
     if form == "drive_norlab":
-        return without_lost(split(load_drive(path, tuple(dict.fromkeys(keys)), chained), train, held_out))
+        return without_lost(split(load_drive(path, tuple(keys), chained), train, held_out))
     if form == "mrclam":
-        robots = tuple(dict.fromkeys(int(key.removeprefix("robot")) for key in keys))
-        return split(load_mrclam(path, robots), train, held_out)
+        return split(load_mrclam(path, mrclam_robots(keys)), train, held_out)
     raise ValueError(f"unknown format {form!r} (known: auto, dataset, drive_norlab, mrclam).")
 
 

@@ -20,6 +20,7 @@ PERIODS = 1.5  # of the commands, by which a change may come earlier or later
 TIMING = (0.05, 0.2)  # s, bounds of that time
 VALUE = (2e-3, 0.005)  # m/s or rad/s, and share of the largest command, by which values may differ
 LONGEST = 3600.0  # s of drive that are compared
+EXACT = 1e-6  # s by which differences of times may be rounded
 ROUNDED = 0.02  # s that times of two tables may differ by, row by row, where they are compared row by row
 NEAR = 0.25
 """Distance of two commands (root mean square over a drive), as a share of the larger one, at which a model still leaves
@@ -98,7 +99,8 @@ def near(a: Course, b: Course, most: float) -> bool:
     """
     if len(a.command.t) == len(b.command.t) and np.allclose(a.command.t, b.command.t, atol=ROUNDED):
         ours, theirs = a.command.table[:, 1:], b.command.table[:, 1:]
-    elif not (a.moves and b.moves) or abs(a.begin - b.begin) > most or abs(a.end - b.end) > TIMING[1] + most:
+    elif not (a.moves and b.moves and abs(a.begin - b.begin) <= most + EXACT
+              and abs(a.end - b.end) <= TIMING[1] + most + EXACT):
         return False
     else:
         t = np.arange(0.0, min(max(a.end - a.begin, b.end - b.begin), LONGEST), TABLE_DT)
@@ -157,7 +159,7 @@ def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]
             if not may_be_alike(glances[group[0]], glances[i]):
                 continue
             shift = shift_between(courses[group[0]], courses[i])
-            if shift is not None and abs(shift) <= most:
+            if shift is not None and abs(shift) <= most + EXACT:
                 group.append(i)
                 break
         else:

@@ -270,6 +270,9 @@ def choose_topics(
         elif stream != "ground_truth" and len(fitting) == 1 and fitting[0] not in TOPICS["ground_truth"]:
             chosen[stream] = fitting[0]
             notes.append(f"{stream} is taken from {fitting[0]}, the only topic of a fitting type")
+        elif stream == "ground_truth" and (others := [name for name in fitting if "odom" not in name]):
+            notes.append(f"no outside pose is taken. {', '.join(others)} may be one: {OPTIONS[stream]} {others[0]}, if "
+                         "it measures the vehicle from outside")
     if "command" not in chosen and "command" not in asked:
         raise ValueError(f"{path}: no command topic found (topics with messages: {listing}). Name the Twist or "
                          "TwistStamped that was sent to the vehicle with --command-topic; or take the measured wheel "

@@ -46,7 +46,8 @@ def _about_folder(path: Path) -> str:
         return f"a LeRobotDataset. {convert}"
     if (path / "dataset.toml").exists() or (path / "trials").is_dir():
         return f"a dataset. Look at it with python -m sysid.inspect {path}, fit it with python -m sysid.fit {path}"
-    if any((path / name).exists() for name in TRIAL_FILES):
+    trial = path.parent.name == "trials" or (path / TRIAL_FILES[0]).exists()
+    if trial and any((path / name).exists() for name in TRIAL_FILES):
         return f"one trial, not a dataset. Give the folder that holds dataset.toml and trials/{path.name}."
     if (path / "report.json").exists() or (path / "vehicle.toml").exists():
         return "the folder of a fit. Give the folder of the dataset; python -m sysid.report shows a fit."
@@ -89,6 +90,8 @@ def _about_file(path: Path) -> str:
     if path.suffix in ROBOT_FILES:
         return (f"a robot file. Look at it with python -m sysid.inspect {path}, fit it to a dataset with python -m "
                 f"sysid.fit DATASET --model {path}")
+    if path.suffix in (".sdf", ".world"):
+        return "a model of Gazebo (SDF). Give the URDF or xacro file of the robot, or an MJCF file."
     return "a file of a kind that is not known. Give a dataset's folder, or a ROS bag to python -m sysid.convert."
 
 

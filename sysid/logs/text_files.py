@@ -33,6 +33,7 @@ TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LEAST = 10  # rows of a stream
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 LONGEST_NAME = 200  # characters
+HOUR = 3600.0  # s
 DAY = 86400.0  # s
 PREAMBLE = 30  # lines above the names
 BACK = (3.0, 0.1)  # usual steps, and s, by which a row may be older than the one before it: it came out of order
@@ -234,14 +235,15 @@ def _numbers(cells: Sequence[str]) -> np.ndarray:
     if np.isfinite(values).any() or not any(":" in cell for cell in cells):
         return values
     values = np.array([_seconds(cell) for cell in cells])
-    days = np.cumsum(np.diff(values, prepend=values[:1]) < -DAY / 2)  # past midnight
-    return values + DAY * days
+    again = DAY if any(cell.count(":") > 1 for cell in cells) else HOUR  # past midnight, or of minutes past the hour
+    return values + again * np.cumsum(np.diff(values, prepend=values[:1]) < -again / 2)
 
 
 def _seconds(cell: str) -> float:
-    """Seconds since 1970 of a date with a time of day, or since midnight; nan of anything else."""
-    if match := re.fullmatch(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)", cell):
-        return 3600 * float(match[1]) + 60 * float(match[2]) + float(match[3].replace(",", "."))
+    """Seconds since 1970 of a date with a time of day, since midnight, or of minutes; nan of anything else."""
+    if match := re.fullmatch(r"(?:(\d{1,2}):(?=\d+:))?(\d{1,2}):(\d{2}(?:[.,]\d+)?)", cell):
+        if match[1] or not match[3].isdigit():  # 12:30 may be hours
+            return HOUR * float(match[1] or 0) + 60 * float(match[2]) + float(match[3].replace(",", "."))
     try:
         found = datetime.fromisoformat(cell.replace(",", "."))
     except ValueError:
@@ -444,11 +446,12 @@ def _stream(
         rounded = ": is its time rounded, as to whole seconds?" if later.mean() < 0.5 else ""
         notes.append(f"{file}: {counted(int((~later).sum()), 'row')} of {len(later)} of {stream} at the time of the "
                      f"row before left out{rounded}")
-    if {"qx", "qy", "qz", "qw"} <= set(found):
+    if {"qz", "qw"} <= set(found):
         from sysid.logs.rosbag import yaw_of
 
+        level = np.zeros(len(found["t"]))  # of a vehicle on a floor qx and qy are often left out
         found["yaw"] = np.array([yaw_of(*one) for one in zip(
-            found["qw"], found["qx"], found["qy"], found["qz"], strict=True)])
+            found["qw"], found.get("qx", level), found.get("qy", level), found["qz"], strict=True)])
     if "yaw" in found:
         found["yaw"] = np.unwrap(found["yaw"])
     return found, notes
@@ -496,7 +499,8 @@ def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> 
         if not {"v", "omega"} <= set(odometry):
             raise ValueError("the odometry has no heading. Name its yaw or its quaternion with --columns.")
         return _dead_reckoned(np.column_stack([t, odometry["v"], odometry["omega"]])), (
-            "the odometry has speeds only: its pose is dead reckoned from them")
+            f"the odometry has {'no heading' if 'x' in odometry else 'speeds only'}: its pose is dead reckoned from "
+            "its speeds")
     x, y, yaw = odometry["x"], odometry["y"], odometry["yaw"]
     if {"v", "omega"} <= set(odometry):
         v, omega = odometry["v"], odometry["omega"]

@@ -27,13 +27,6 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
             found.append(f"{name}: its rows come in bursts, {max(bursts):.2g} s apart, while most follow one "
                          "another at once: t is a time of receipt. Use the times of measurement; sysid.convert takes "
                          "them with --stamp header.")
-    timeout = command_timeout(trials)
-    if timeout is not None:
-        found.append(f"command: in {timeout.trials} of {len(trials)} trials ({timeout.first}, at {timeout.at:.1f} s) "
-                     f"no command comes for {timeout.pause:.2g} s, and the vehicle stops {timeout.value:.2f} s "
-                     f"({timeout.low:.2f} to {timeout.high:.2f}) after the last one: its base has a time-out. Fits "
-                     f"take it from the log; to state it, write command_timeout = {max(timeout.value, 0.01):.2f} into "
-                     "dataset.toml.")
     if cut := [(trial.name, rest) for trial in trials if (rest := uncommanded(trial))]:
         name, rest = cut[0]
         found.append(f"command: in {len(cut)} of {len(trials)} trials ({name}) the commands end {rest:.1f} s before "
@@ -46,6 +39,17 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
                      f"{seconds:.2g} s in which the vehicle hardly moved, though it drives before and after: the clock "
                      "was set forward. Split the trial there, or take the jump out of all of its streams.")
     return found
+
+
+def pauses(trials: Sequence[Trial]) -> list[str]:
+    """A sentence on pauses of the commands in which the base stops by itself."""
+    timeout = command_timeout(trials)
+    if timeout is None:
+        return []
+    return [f"command: in {timeout.trials} of {len(trials)} trials ({timeout.first}, at {timeout.at:.1f} s) no command "
+            f"comes for {timeout.pause:.2g} s, and the vehicle stops {timeout.value:.2f} s ({timeout.low:.2f} to "
+            f"{timeout.high:.2f}) after the last one: its base has a time-out. Fits take it from the log; to state it, "
+            f"write command_timeout = {max(timeout.value, 0.01):.2f} into dataset.toml."]
 
 
 def uncommanded(trial: Trial) -> float:

@@ -16,7 +16,7 @@ from sysid.logs.records import Command, Log, OdometryStream, Start, Trial
 from sysid.logs.replicates import same_course
 
 WINDOW = 20.0
-"""Length of a window [s]: long for a vehicle's delays, lags and turns, short for the drift of a replay."""
+"""Greatest length of a window [s]: long for a vehicle's delays, lags and turns, short for the drift of a replay."""
 LONG = 6 * WINDOW
 """Length from which a drive is cut [s]."""
 AROUND = 0.25
@@ -38,20 +38,27 @@ def in_windows(log: Log) -> Log:
             continue
         parts = windows_of(trial)
         trials += parts
-        notes.append(f"{trial.name} lasts {trial.duration:.0f} s: it is taken as {len(parts)} windows of {WINDOW:g} s, "
-                     "each from where it was measured to be")
+        notes.append(f"{trial.name} lasts {trial.duration:.0f} s: it is taken as {len(parts)} windows of "
+                     f"{length_of(trial):.3g} s, each from where it was measured to be")
     return replace(log, trials=tuple(trials), notes=tuple(notes))
+
+
+def length_of(trial: Trial) -> float:
+    """Length of a trial's windows [s]: it is cut into equal ones, so that nothing of its end is lost."""
+    return trial.duration / np.ceil(trial.duration / WINDOW - TINY)
 
 
 def windows_of(trial: Trial) -> list[Trial]:
     """Windows of a trial that have anything to score, in order."""
-    found = [_window(trial, k) for k in range(int(trial.duration // WINDOW))]
+    length = length_of(trial)
+    found = [_window(trial, k, length) for k in range(round(trial.duration / length))]
     return [one for one in found if one is not None]
 
 
-def _window(trial: Trial, number: int) -> Trial | None:
+def _window(trial: Trial, number: int, length: float) -> Trial | None:
     """The window of that number; the trial's own start for the first one. None where hardly anything was measured."""
-    begin, end = number * WINDOW, (number + 1) * WINDOW
+    begin, end = number * length, (number + 1) * length
+    end += TINY if end > trial.duration - TINY else 0.0  # its last sample counts
     path = trial.ground_truth
     if path is not None:  # it begins at a pose that was measured
         later = path.t[(path.t >= begin) & (path.t < end)]

@@ -132,7 +132,8 @@ class Drives:
         def at(index: Any, weight: Any, columns: slice) -> np.ndarray:
             place = first + np.asarray(index)
             before, after = (flat.take(place + step, axis=0)[..., columns].astype(float) for step in (0, 1))
-            return before + np.asarray(weight)[..., None] * (after - before)
+            with np.errstate(invalid="ignore"):  # a replay that diverged is infinite
+                return before + np.asarray(weight)[..., None] * (after - before)
 
         one = self.batch
         pose = at(one.pose_index, one.pose_weight, POSE)

@@ -61,19 +61,22 @@ def with_values(values: np.ndarray, names: Sequence[str], changes: dict[str, flo
     return out
 
 
-def at_fit(evidence: Evidence, residual: np.ndarray, jacobian: np.ndarray, moved: np.ndarray) -> Evidence:
+def at_fit(evidence: Evidence, residual: np.ndarray, jacobian: np.ndarray, moved: np.ndarray,
+           held: np.ndarray | float = 0.0) -> Evidence:
     """The evidence after a fit of the base and of some coordinates, which join the base.
 
     Args:
         residual: (B, n) white residual there.
         jacobian: (B, n, P + k) of the white features there.
         moved: (P,) how far the base parameters are from the reference.
+        held: (k,) prior precision of the coordinates.
     """
     size, extra = evidence.base_size, jacobian.shape[-1] - evidence.base_size
     residual = residual + jacobian[..., :size] @ moved
     design = np.concatenate([jacobian, evidence.design[..., size:]], axis=-1)
     precision = np.zeros((size + extra, size + extra))
     precision[:size, :size] = evidence.precision
+    precision[range(size, size + extra), range(size, size + extra)] = held
     columns = tuple(replace(c, index=tuple(i + extra for i in c.index)) for c in evidence.columns)
     return replace(evidence, residual=residual, design=design, base_size=size + extra, columns=columns,
                    precision=precision, products=np.einsum("bni,bnj->bij", design, design, optimize=True),

@@ -118,7 +118,7 @@ def manoeuvre_groups(drives: Drives) -> tuple[tuple[int, ...], ...]:
     for i, trial in enumerate(drives.trials):
         names.setdefault(trial.manoeuvre, []).append(i)
     if len(names) > 40 or len(names) < len(drives.trials) and not repeated(drives.trials):
-        parts = np.array_split(np.arange(len(drives.trials)), 8)
+        parts = np.array_split(np.arange(len(drives.trials)), min(8, len(drives.trials)))
         return tuple(tuple(int(i) for i in part) for part in parts)
     return tuple(tuple(each) for each in names.values())
 

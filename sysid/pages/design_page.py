@@ -12,6 +12,7 @@ from sysid.errors.space import Space
 from sysid.intervals.design import Criterion, Plan, Proposal
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
+from sysid.pages.loop_words import MANOEUVRE_WORDS
 from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, table
 from whill_mjx.io.svg import PALETTE, Axes, Line, line_chart
 from whill_mjx.logs.dataset import write_text
@@ -42,9 +43,16 @@ def text(found: Proposal, criterion: Criterion) -> str:
 def meaning(chosen: Sequence[Plan], space: Space, before: np.ndarray) -> str:
     """One sentence: what to drive, and what becomes of the parameter that is known worst."""
     index = int(np.argmax(before))
-    drives = " and then ".join(plan.candidate.name.replace("_", " ") for plan in chosen)
+    drives = " and then ".join(in_words(plan.candidate.name) for plan in chosen)
     return (f"Drive {drives} next: the uncertainty of {space.names[index]}, the largest, shrinks from "
             f"{before[index]:.1%} to {chosen[-1].deviation[index]:.1%} of its range.")
+
+
+def in_words(name: str) -> str:
+    """A manoeuvre of the library in words, with its name; NAME_50 is the one of half size."""
+    whole = name.removesuffix("_50")
+    said = MANOEUVRE_WORDS.get(whole, f"the {whole.replace('_', ' ')}") + (" at half size" if whole != name else "")
+    return f"{said} ({name})"
 
 
 def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:

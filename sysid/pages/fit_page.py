@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.coverage import CHECK
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
@@ -62,7 +63,7 @@ def summary(report: dict[str, Any], series: Sequence[TrialSeries]) -> str:
     held, train = report["summary"]["held_out"], report["summary"]["training"]
     dataset = report["dataset"]
     notes = dataset.get("notes") or []
-    parts = [paragraph(" ".join(lead(report)[1:])), *(paragraph(f"{note[0].upper()}{note[1:]}.")
+    parts = [paragraph(" ".join(lead(report)[1:])), *(paragraph(f"{note[0].upper()}{note[1:].rstrip('.')}.")
                                                           for note in notes if _is_limit(note))]
     shown = shown_drive(series_paths(series, list(REPLAY_WORDS)))
     if shown is not None:
@@ -85,11 +86,13 @@ def lead(report: dict[str, Any]) -> list[str]:
     """Three sentences: how good the fit is, what it changed, and what it does not know."""
     known = [one for one in report["parameters"] if one["identifiable"]]
     unknown = [one["name"] for one in report["parameters"] if not one["identifiable"]]
-    moved = sorted(known, key=_change, reverse=True)[:2]
+    inside = [one for one in known if not one["remark"] and _change(one) > 1]  # not at the end of its range
+    moved = sorted(inside, key=_change, reverse=True)[:2]
     changed = "; ".join(f"{_spoken(one['name'])} from {number(one['initial'])} to {number(one['value'])}"
                         + ("" if one["unit"] == "-" else f" {one['unit']}") for one in moved)
-    second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; most surely changed: "
-              f"{changed}." if known else "This log determines none of the parameters.")
+    second = (f"This log determines {len(known)} of {len(report['parameters'])} parameters; "
+              f"{f'most surely changed: {changed}' if moved else 'none surely changed'}."
+              if known else "This log determines none of the parameters.")
     if not report["summary"]["held_out"]:
         third = "Nothing was held out, so how well the vehicle predicts other drives is not known."
     elif unknown:
@@ -114,8 +117,8 @@ def series_paths(series: Sequence[TrialSeries], replays: Sequence[str]) -> list[
 
 
 def _is_limit(note: str) -> bool:
-    """Whether a note says what the log does not determine."""
-    return note.startswith(("not fitted", "the log has no commands"))
+    """Whether a note says what the log does not determine, or what is wrong with it."""
+    return note.startswith(("not fitted", "the log has no commands", CHECK))
 
 
 def _spoken(name: str) -> str:
@@ -276,7 +279,7 @@ def residuals(series: Sequence[TrialSeries], drawn: Sequence[TrialSeries]) -> st
         parts += [legend([(_label(trial), PALETTE[k % len(PALETTE)]) for k, trial in enumerate(mine)]), charts(items),
                   heading(f"{CHANNEL_NAMES[channel].capitalize()}: autocorrelation of the residual about zero"),
                   legend([("training trials", PALETTE[0]), ("held-out trials", PALETTE[1])]),
-                  charts(_autocorrelations(series, channel), "White noise would lie in the band for 95 % of the lags.")]
+                  charts(_autocorrelations(series, channel), "White noise would lie in the band for 95% of the lags.")]
     return "".join(parts)
 
 
@@ -379,7 +382,7 @@ def search(report: dict[str, Any]) -> str:
     costs = [cost for cost in about.get("start_costs") or [] if cost is not None]
     if costs:
         near = sum(1 for cost in costs if cost < 1.02 * min(costs))
-        rows.append(["starts within 2 % of the best", f"{near} of {len(costs)}"])
+        rows.append(["starts within 2% of the best", f"{near} of {len(costs)}"])
     items = [line_chart([Line(np.array(one["values"], float), np.array(one["cost"], float), markers=True)],
                         f"{one['name']} [s]", "cost", "delay profile", Axes(width=320, height=220))
              for one in about.get("delay_profiles") or []]

@@ -10,7 +10,17 @@ import numpy as np
 from sysid.logs.metrics import METRICS, UNITS, integrate
 from sysid.logs.records import Start
 from sysid.pages.before_after import drive_pictures, drive_table
-from sysid.pages.loop_words import command_of, describe_unnamed, lead, not_determined, sentence, spoken, title, vehicles
+from sysid.pages.loop_words import (
+    another_floor,
+    command_of,
+    describe_unnamed,
+    lead,
+    not_determined,
+    sentence,
+    spoken,
+    title,
+    vehicles,
+)
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table
 from whill_mjx.io.svg import PALETTE, Axes, Line, bar_chart, line_chart
 from whill_mjx.logs.dataset import write_text
@@ -28,6 +38,8 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections = [Section("What was found", found(report))]
     if report["effects"]:
         sections.append(Section("How large it is", effects(report)))
+    if report["weights"]:
+        sections.append(Section("How sure it is", weights(report)))
     if report["next_manoeuvre"] is not None:
         sections.append(Section("Next drive", next_drive(report["next_manoeuvre"])))
     sections += [Section("All drives", errors(report)), Section("Each manoeuvre", by_manoeuvre(report))]
@@ -48,8 +60,13 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
 def found(report: dict[str, Any]) -> str:
     """Three sentences, what to do about doubts, and one drive before and after."""
     parts = [paragraph(" ".join(lead(report)[1:]))]
-    if report["advice"]:
-        parts += [heading("Before you rely on it"), bullets(report["advice"])]
+    if another_floor(report):
+        rows = [[one["quantity"], "" if one["unit"] == "-" else one["unit"], one["before"], one["value"],
+                 *one["interval"]] for one in report["floor"]["members"]]
+        parts += [heading("Another floor"), table(["measured without the model", "unit", "reference", "these drives",
+                                                   "95 % from", "to"], rows)]
+    if advice := [*report["log_doubts"], *report["advice"]]:
+        parts += [heading("Before you rely on it"), bullets(advice)]
     if text := report["noise_sentence"]:
         parts.append(paragraph(f"{text[0].upper()}{text[1:]}."))
     if report["contradicted"]:
@@ -70,12 +87,22 @@ def effects(report: dict[str, Any]) -> str:
             was = p.get("was")
             rows.append([spoken(one["name"]), p.get("description") or name, p["value"], *p["interval"], p["unit"],
                          was if was is not None and np.isfinite(was) else "none", name])
-    parts = [table(["effect", "what it is", "value", "95 % from", "to", "unit", "before", "name in vehicle.toml"],
+    parts = [table(["effect", "what it is", "value", "95% from", "to", "unit", "before", "name in vehicle.toml"],
                    rows)]
     if left_open := [text for one in report["effects"] for text in not_determined(one["parameters"])]:
         parts.append(bullets(left_open))
     parts.append(bullets([f"{spoken(one['name'])}: {one['equation']}" for one in report["effects"] if one["equation"]]))
     return "".join(parts)
+
+
+def weights(report: dict[str, Any]) -> str:
+    """Posterior weights as bars."""
+    words = {"none": "nothing", "noise": "only the noise", "unknown": "something unknown"}
+    named = {words.get(name) or " and ".join(spoken(one) for one in name.split(" + ")): weight
+             for name, weight in report["weights"].items()}
+    chart = bar_chart(list(named), {"weight": list(named.values())}, "posterior weight", log_y=False)
+    return charts([chart], "What is missing: posterior weights of nothing, of effects and pairs of them, and of "
+                           "something that the catalogue does not have")
 
 
 def evidence(report: dict[str, Any]) -> str:
@@ -101,7 +128,7 @@ def agreement(effect: dict[str, Any]) -> str:
             "untold": "are too few, or see too little of it, to differ on its size"}[test["outcome"]]
     return (f"{test['manoeuvres']} manoeuvres excite {effect['name']}. They {said} (p = {test['p_value']:.2g}, power "
             f"{test['power']:.0%}). Left out, manoeuvres gain {evidence['left_out_total']:.0f} of squared residual "
-            f"together (95 % interval {low:.0f} to {high:.0f}).")
+            f"together (95% interval {low:.0f} to {high:.0f}).")
 
 
 def predictions(effect: dict[str, Any]) -> str:
@@ -175,7 +202,7 @@ def by_manoeuvre(report: dict[str, Any]) -> str:
                              f"[{unit}]", factor * row["before"], factor * row["after"],
                              *(factor * end for end in row["interval"]), row["trials"]])
         if rows:
-            parts.append(table(["manoeuvre", "usual error", "as it was", "after", "change, 95 % from", "to", "drives"],
+            parts.append(table(["manoeuvre", "usual error", "as it was", "after", "change, 95% from", "to", "drives"],
                                rows, words))
     return "".join(parts)
 

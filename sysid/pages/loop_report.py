@@ -31,11 +31,14 @@
                       noise, as a share of it, before and after; share `explained` of what could be predicted; of
                       simulated days that were refitted (`--refit-nulls`, else null) count, calibrated p-value, false
                       alarms and the upper 95 % bound of their rate
-    steps             the numbers behind the verdict: gain of each set of effects, and what it leaves that replicates
-                      have in common, smooth functions predict, or may be at random (`sysid.verdict.rounds.Asked`)
+    weights           posterior weights of `none` or `noise`, of sets of effects (" + " between them), of `unknown`
+    steps             the sets of effects that were weighed: gain, gain of each effect beside other forms of the others
+                      (`own`) and its p-value, what is left that replicates have in common, smooth functions predict, or
+                      may be at random, and the share explained (`sysid.verdict.posterior.Findings`)
     operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
                       of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
                       the share of simulated days on which it would be noticed, at factors on its size
+    log_doubts        what is wrong with the log itself, in sentences
     contradicted      what speaks against an effect that would else have been named, in sentences
     pairs             of the scan: the pairs of effects that explain most together
     candidates        per round the refitted effects: gain, share of the residual explained, coordinates
@@ -81,6 +84,7 @@ from sysid.follow_up.trust import (
     warnings,
 )
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
+from sysid.logs.coverage import doubts
 from sysid.logs.metrics import METRICS, own_floor
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
@@ -128,9 +132,11 @@ def make_report(result: Result) -> dict[str, Any]:
              if result.reference.known else "what the model family lacks")
     nulls = result.null_refits
     noise = {} if result.noise is None else result.noise.report()
+    base = base_table(result)
+    same = found.verdict == "none" and not shifts(base) and not (result.floor and result.floor.named)
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
-        "noise": noise, "noise_sentence": said(noise, found.verdict == "none") or None,
+        "noise": noise, "noise_sentence": said(noise, same) or None,
         "warnings": warnings(result),
         "advice": advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
         "remark": result.reference.remark,
@@ -145,7 +151,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "alone": alone(result, trials, before), "change": change(rows),
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
-        "contradicted": contradicted(result), "pairs": pairs_of(result),
+        "log_doubts": doubts(result.log), "contradicted": contradicted(result), "pairs": pairs_of(result),
         "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
                     "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
                     "excess_before": found.excess[0],
@@ -153,7 +159,7 @@ def make_report(result: Result) -> dict[str, Any]:
                     "null_refits": None if nulls is None else {
                         "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
                         "upper": nulls.upper}},
-        "steps": found.steps,
+        "weights": found.weights, "steps": steps(result),
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
@@ -162,7 +168,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "lives_in": where_it_lives(result) if found.verdict == "unexplained" else [],
         "unnamed": None if wrench is None else as_report(wrench),
         "floor": None if result.floor is None else {**result.floor.report(), "sentence": result.floor.said()},
-        "next_manoeuvre": next_manoeuvre(result), "base": base_table(result), "seconds": result.seconds,
+        "next_manoeuvre": next_manoeuvre(result), "base": base, "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
 
@@ -247,6 +253,16 @@ def operating(result: Result, days: Days) -> dict[str, Any]:
                 power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
     return {"alpha": alpha, "decisions": EFFORT.rounds + 2, "days": "simulated, linear",
             "false_alarms": false_alarms(days, alpha), "power": power}
+
+
+def steps(result: Result) -> list[dict[str, Any]]:
+    """The sets of effects that were weighed: what they gain, and what they leave though it could be predicted."""
+    findings, priors = result.search.findings, result.config.thresholds
+    if findings is None:
+        return []
+    return [{"effects": list(one.variants), "gain": one.gain, "own": list(one.own), "p": list(one.p),
+             "left": findings.predictable(one.left, priors.form**2, priors.alpha),
+             "share": findings.named(one, priors)} for one in findings.sets]
 
 
 def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
@@ -397,7 +413,7 @@ def shifts(rows: list[dict[str, Any]], least: float = FAR) -> list[str]:
 
 def summary(report: dict[str, Any], width: int = 100) -> str:
     """What a person reads first, in lines of at most `width` characters."""
-    lines = [title(report), *lead(report), *report["advice"]]
+    lines = [title(report), *lead(report), *report["log_doubts"], *report["advice"]]
     if report["noise_sentence"] is not None:
         lines.append(f"noise: {report['noise_sentence']}")
     lines += ["", f"verdict: {report['verdict']} - {report['reason']}",
@@ -432,6 +448,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     from sysid.pages.loop_page import write_page
     from sysid.pages.method_page import write_method
     from sysid.pages.report import write_report
+    from sysid.verdict.posterior import write as write_evidence
     from whill_mjx.vehicle.vehicle_file import save_vehicle
 
     out = Path(out)
@@ -447,6 +464,8 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
                   "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],
                   "effects_added": [one["name"] for one in report["effects"]] + ["unnamed"] * kept})
     write_next_command(out, report["next_manoeuvre"])
+    if result.search.findings is not None:
+        write_evidence(out / "evidence.json", result.search.findings)
     write_report(out / "report.json", report)
     write_page(out, report)
     write_method(out, report)

@@ -16,15 +16,27 @@ FAR = 2.0  # day-to-day spreads, beyond which a refit went further than days do
 
 def title(report: Mapping[str, Any]) -> str:
     """What was found, in one line: `Missing: command delay 0.152 s (0.113 to 0.190)`."""
-    if report["verdict"] == "none":
-        return "Nothing is missing that these drives show"
-    if report["verdict"] != "named":
-        return "Something is missing that no known effect explains"
+    floor = ["another floor"] if another_floor(report) else []
+    if report["verdict"] == "none" and not floor:
+        return "No known effect stands out in these drives" if untold(report) else (
+            "Nothing is missing that these drives show")
+    if report["verdict"] == "unexplained":
+        return "; ".join(["Something is missing that no known effect explains", *(f"changed: {one}" for one in floor)])
     changed = [one for one in report["effects"] if is_change(one)]
-    missing = [one for one in report["effects"] if one not in changed]
-    parts = [f"{what}: {'; '.join(map(sized, those))}" for what, those in (("Missing", missing), ("Changed", changed))
-             if those]
-    return "; ".join(parts)
+    missing = [sized(one) for one in report["effects"] if one not in changed]
+    parts = [("Missing", missing), ("Changed", [*map(sized, changed), *floor])]
+    return "; ".join(f"{what}: {'; '.join(those)}" for what, those in parts if those)
+
+
+def another_floor(report: Mapping[str, Any]) -> bool:
+    """Whether gyro and wheels show another floor than that of the reference."""
+    return bool((report.get("floor") or {}).get("name"))
+
+
+def untold(report: Mapping[str, Any]) -> bool:
+    """Whether neither other days nor repeats show how large the noise of the drives is."""
+    errors = [one for part in report["before"].values() for one in part.values()]
+    return not report.get("known", True) and not any(one.get("noise_floor") for one in errors)
 
 
 def lead(report: Mapping[str, Any]) -> list[str]:
@@ -55,7 +67,7 @@ def size(one: Mapping[str, Any]) -> str:
         return f"of a size that these drives do not show (best {value:.{digits}f}{unit})"
     if above or below:
         return f"{'above' if above else 'below'} {low if above else high:.{digits}f}{unit}"
-    text = f"{value:.{digits}f}{unit} ({low:.{digits}f} to {high:.{digits}f})"
+    text = f"{value:z.{digits}f}{unit} ({low:.{digits}f} to {high:.{digits}f})"
     was = one.get("was")
     return text if was is None or not _differs(one) else f"{text}, before {factor * was:.{digits}f}"
 
@@ -72,7 +84,7 @@ def spoken(name: str) -> str:
 
 def prediction(report: Mapping[str, Any]) -> str:
     """How far off the vehicles are on drives that were not fitted."""
-    part = "held_out" if report["before"]["held_out"] else "training"
+    part = "held_out" if any(report["before"]["held_out"].values()) else "training"
     channel = next((name for name in ("ground_truth", "odometry")
                     if "trajectory" in report["before"][part].get(name, {})), None)
     if channel is None:
@@ -160,6 +172,16 @@ def not_determined(parameters: Mapping[str, Any]) -> list[str]:
 
 
 def _found(report: Mapping[str, Any]) -> str:
+    if report["verdict"] == "none" and untold(report):
+        return ("Nothing shows how much of the error is noise: no drive was repeated, and there is no reference. "
+                "Whether anything without a name is missing is unknown.")
+    far = sorted((row for row in report.get("base", ()) if abs(row["away"]) > FAR), key=lambda row: -abs(row["away"]))
+    if report["verdict"] == "none" and another_floor(report):
+        return "These drives differ from the reference as on another floor; no effect stands out beside that."
+    if report["verdict"] == "none" and report.get("known", True) and far:
+        more = f", and {len(far) - 1} more" if len(far) > 1 else ""
+        return ("No effect stands out, but the vehicle differs from its other days by more than they do: "
+                f"{spoken(far[0]['name'].partition('.')[2])} by {abs(far[0]['away']):.0f} day-to-day spreads{more}.")
     if report["verdict"] == "none":
         return ("The vehicle drives as it did on its other days; differences are within its noise and its day-to-day "
                 "spread." if report.get("known", True) else "The model describes these drives to within their noise.")
@@ -198,10 +220,12 @@ def _may_be_none(one: Mapping[str, Any]) -> bool:
 
 
 def _differs(one: Mapping[str, Any]) -> bool:
-    """Whether a parameter had a size before that is surely more than none."""
+    """Whether a parameter had a size before that is surely more than none, or was further from none than it is now."""
     was, neutral = one.get("was"), one.get("neutral")
+    if was is None or not math.isfinite(was) or neutral is None:
+        return was is not None and math.isfinite(was)
     low, high = one["interval"]
-    return was is not None and math.isfinite(was) and (neutral is None or abs(was - neutral) > (high - low) / 2)
+    return abs(was - neutral) > min((high - low) / 2, abs(one["value"] - neutral))
 
 
 def _digits(low: float, high: float) -> int:

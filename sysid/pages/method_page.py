@@ -37,7 +37,7 @@ def verdict(report: dict[str, Any]) -> str:
     if nulls := missing["null_refits"]:
         parts.append(paragraph(f"Of {nulls['count']} simulated days with nothing missing, fitted in the same way, "
                                f"{nulls['false_alarms']} raise a false alarm (at most {nulls['upper']:.1%} of all, "
-                               f"with 95 % confidence). Calibrated p-value: {nulls['p_value']:.2g}."))
+                               f"with 95% confidence). Calibrated p-value: {nulls['p_value']:.2g}."))
     if report["warnings"]:
         parts += [paragraph("Doubts about the names, also those that ask for nothing:"), bullets(report["warnings"])]
     return "".join(parts)
@@ -48,7 +48,7 @@ def operating(report: dict[str, Any]) -> str:
     one = report["operating"]
     alarms = one["false_alarms"]
     parts = [paragraph(f"Of {alarms['count']} simulated days with nothing missing the scan takes {alarms['alarms']} "
-                       f"for more (at most {alarms['upper']:.1%} of all, with 95 % confidence); each of up to "
+                       f"for more (at most {alarms['upper']:.1%} of all, with 95% confidence); each of up to "
                        f"{one['decisions']} decisions may err in {one['alpha']:.1%}.")]
     rows = [[each["effect"], f"{size['factor']:g}", f"{size['noticed']:.0%}"]
             for each in one["power"] for size in each["sizes"]]
@@ -72,7 +72,7 @@ def candidates(report: dict[str, Any]) -> str:
                              one["p_value"]] for one in each], f"round {number}"))
     left = ("common", "smooth", "any")
     rows = [[" and ".join(one["effects"]), one["gain"], *(one["left"].get(key, "") for key in left),
-             f"{one['share']:.0%}"] for one in report["steps"] if "share" in one]
+             f"{one['share']:.0%}"] for one in report["steps"]]
     if rows:
         parts.append(table(["effects", "gain", "replicates share", "smooth functions predict", "may be at random",
                             "share"], rows, "what they gain, and what they leave though it could be predicted"))
@@ -83,7 +83,7 @@ def noise(report: dict[str, Any]) -> str:
     """Noise of each channel beside that of the reference days."""
     rows = [[name, one["factor"], *one["interval"], "yes" if one["changed"] else ""]
             for name, one in report["noise"].items()]
-    return table(["channel", "noise over that of the reference days", "95 % from", "to", "surely another"], rows)
+    return table(["channel", "noise over that of the reference days", "95% from", "to", "surely another"], rows)
 
 
 def base(report: dict[str, Any]) -> str:

@@ -120,7 +120,7 @@ def _searched(
         drive = drive_entries(robot)
         names = (*(one for one in names if not ((robot.added or robot.motors) and one.startswith("actuator."))),
                  *drive, turning_inertia(robot),
-                 *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding),
+                 *(f"geom.{host.geom(geom).name}.friction" for geom in robot.sliding if host.geom_friction[geom, 0]),
                  *(name for name in sizes if len(robot.wheels) == 2 or name != "wheels.track"))
     if robot.motors:
         gain, high = robot.drive_gain

@@ -11,6 +11,7 @@ import numpy as np
 from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RAMP, SECONDS, SPIN, RobotDrive
 
+ALONE = 0.999  # of the weight on two wheels, from which nothing else carries a robot
 STRAIGHT = 0.1  # share by which the speed may differ from the command
 LIGHT = 0.02  # share of the weight below which what touches the floor is not listed
 
@@ -120,6 +121,9 @@ def _missing(robot: Robot, check: Check) -> list[str]:
     if carried < 0.3:
         found.append(f"the driven wheels carry {carried:.0%} of the weight: they may spin. Check the heights of "
                      "casters and wheels, and the centre of mass")
+    if len(robot.wheels) == 2 and carried > ALONE:
+        found.append("it stands on its two driven wheels alone and tips: the file has no caster, or the robot balances "
+                     "by a controller of its own, which is not in the file")
     if not check.drives_straight:
         found.append("it does not drive straight on within a tenth of the commanded speed: check axes of the wheels, "
                      "what drags on the floor, and friction")

@@ -34,13 +34,76 @@ def touches_ground(host: mujoco.MjModel, geom: int) -> bool:
 
 
 def radius_of(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
-    """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round."""
+    """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round; else how far its
+    shapes reach."""
     round_ones = [int(one) for one in parts(host, body) if int(host.geom_type[one]) in map(int, ROUND)]
     touching = [one for one in round_ones if touches_ground(host, one)]
     sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
-    if not sizes and known is None:
-        raise ValueError(f"{path}: the wheel has no sphere, cylinder or capsule to give its radius. Give wheel_radius.")
-    return max(sizes) if sizes else float(known or 0.0)
+    if sizes or known is not None:
+        return max(sizes) if sizes else float(known or 0.0)
+    reach = reach_of(host, body)
+    if reach == 0.0:
+        raise ValueError(f"{path}: wheel {host.body(body).name} has no shape that gives its radius. Give it a cylinder "
+                         "or a sphere, or wheel_radius.")
+    return reach
+
+
+def reach_of(host: mujoco.MjModel, body: int) -> float:
+    """How far the shapes of a wheel, and of rollers on it, reach from its axle [m]; 0 without any."""
+    data = mujoco.MjData(host)
+    mujoco.mj_kinematics(host, data)
+    joint = int(host.body_jntadr[body])
+    axis = data.xaxis[joint]
+    reach = 0.0
+    for geom in range(host.ngeom):
+        over = int(host.geom_bodyid[geom])
+        while over not in (0, body):
+            over = int(host.body_parentid[over])
+        if over != body:
+            continue
+        points = data.geom_xpos[geom] + _corners(host, geom) @ data.geom_xmat[geom].reshape(3, 3).T
+        away = points - data.xanchor[joint]
+        away = away - np.outer(away @ axis, axis)
+        margin = float(host.geom_size[geom, 0]) if int(host.geom_type[geom]) in map(int, ROUND) else 0.0
+        reach = max(reach, float(np.linalg.norm(away, axis=1).max()) + margin)
+    return reach
+
+
+def _corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Points (K, 3) of a geom in its own frame: vertices of a mesh, corners of a box, the middle of a ball."""
+    kind, mesh = int(host.geom_type[geom]), int(host.geom_dataid[geom])
+    if kind == int(mujoco.mjtGeom.mjGEOM_MESH):
+        first = int(host.mesh_vertadr[mesh])
+        return np.asarray(host.mesh_vert[first : first + int(host.mesh_vertnum[mesh])], float)
+    signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)], float)
+    size = np.array(host.geom_size[geom], float)
+    if kind in map(int, ROUND):
+        size = np.array([0.0, 0.0, 0.0 if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE) else size[1]])
+    return signs * size
+
+
+def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequence[int]) -> list[str]:
+    """Let wheels of a URDF that are meshes, boxes or rollers roll as spheres that reach as far, a note for each."""
+    notes = []
+    for body in bodies:
+        shapes = [int(host.geom_type[one]) for one in np.flatnonzero(host.geom_bodyid == body)]
+        radius, one = reach_of(host, body), spec.body(host.body(body).name)
+        if any(shape in map(int, ROUND) for shape in shapes) or radius == 0.0:
+            continue
+        if not one.explicitinertial:
+            one.explicitinertial, one.mass, one.ipos = True, host.body_mass[body], host.body_ipos[body]
+            one.iquat, one.inertia = host.body_iquat[body], host.body_inertia[body]
+        for geom in list(one.geoms):
+            spec.delete(geom)
+        for geom in one.find_all("geom"):
+            geom.contype, geom.conaffinity = 0, 0
+        one.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0.0, 0.0], contype=0, conaffinity=1, mass=0.0,
+                     pos=host.jnt_pos[host.body_jntadr[body]], solref=FIRM_TIME, solimp=FIRM, solmix=ALONE,
+                     name=one.name)
+        what = "is no cylinder or sphere" if shapes else "has rollers, which are left out"
+        notes.append(f"{path.name}: wheel {one.name} {what}: it rolls on the {radius:.4g} m by which it reaches from "
+                     "its axle")
+    return notes
 
 
 def below_wheels(

@@ -36,7 +36,7 @@ class RobotDrive:
         """Motion (N, B, S, 6) of N parameter sets on B trials."""
         robot = self._robot
         sets, trials, steps = commands.shape[:3]
-        models = [self._model(i, {name: one[i] for name, one in values.items()}) for i in range(sets)]
+        models = [self.model(i, {name: one[i] for name, one in values.items()}) for i in range(sets)]
         host = models[0]
         width = mujoco.mj_stateSize(host, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         first = np.zeros((sets, trials, width))
@@ -44,27 +44,33 @@ class RobotDrive:
         first[..., place], first[..., speed] = states.qpos, states.qvel
         if host.na:
             first[..., speed.stop : speed.stop + host.na] = robot.activation
-        half = commands[..., 1] * robot.track / 2
-        control = np.zeros((sets, trials, steps, host.nu))
-        wanted = (commands[..., 0] - half, commands[..., 0] + half)
-        for side, one, sign in zip(robot.sides, robot.actuators, robot.sign, strict=True):
-            gear = host.actuator_gear[one, 0] if robot.motors else 1.0
-            control[..., one] = sign * wanted[side] / robot.wheel_radius * gear
-        for side, one, sign in zip(robot.sides, robot.integrals, robot.sign, strict=False):
-            control[..., one] = sign * wanted[side] / robot.wheel_radius
+        control = self.controls(commands)
         rows = sets * trials
         data = [mujoco.MjData(host) for _ in range(min(cores(), rows))]
         path, _ = rollout.rollout([models[i // trials] for i in range(rows)], data, first.reshape(rows, -1),
                                   control.reshape(rows, steps, -1), nstep=steps)
         path = path.reshape(sets, trials, steps, -1)
-        seen = self._observe(path[..., place], path[..., speed])
+        seen = self.observe(path[..., place], path[..., speed])
         if warm_up:
             seen = _from(seen, warm_up, starts)
         lost = ~(np.abs(seen) < LOST).all(-1)
         seen[lost] = 0.0
         return np.concatenate([seen, np.maximum.accumulate(lost, axis=2)[..., None]], axis=-1)
 
-    def _model(self, number: int, values: Mapping[str, float]) -> mujoco.MjModel:
+    def controls(self, commands: np.ndarray) -> np.ndarray:
+        """What the actuators (..., nu) are told where the robot is told v [m/s], omega [rad/s] (..., 2)."""
+        robot, host = self._robot, self._robot.host
+        half = commands[..., 1] * robot.track / 2
+        control = np.zeros((*commands.shape[:-1], host.nu))
+        wanted = (commands[..., 0] - half, commands[..., 0] + half)
+        for side, one, sign in zip(robot.sides, robot.actuators, robot.sign, strict=True):
+            gear = host.actuator_gear[one, 0] if robot.motors else 1.0
+            control[..., one] = sign * wanted[side] / robot.wheel_radius * gear
+        for side, one, sign in zip(robot.sides, robot.integrals, robot.sign, strict=False):
+            control[..., one] = sign * wanted[side] / robot.wheel_radius
+        return control
+
+    def model(self, number: int, values: Mapping[str, float]) -> mujoco.MjModel:
         """The robot's model with values put in, one of a pool."""
         robot, nominal = self._robot, self._robot.host
         while len(self._models) <= number:
@@ -79,7 +85,7 @@ class RobotDrive:
             _close_loop(model, nominal, robot, float(values["drive.kp"]))
         return model
 
-    def _observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         """(..., 5) x, y, yaw of the reference point, v and omega of the wheels."""
         robot = self._robot
         quaternion = qpos[..., robot.root + 3 : robot.root + 7]
@@ -111,9 +117,10 @@ def _close_loop(model: mujoco.MjModel, nominal: mujoco.MjModel, robot: Robot, kp
     """Put the speed controller before motors into their law: torque = gain kp (target - speed)."""
     for one in robot.actuators:
         gain, gear = model.actuator_gainprm[one, 0], model.actuator_gear[one, 0]
+        slope = abs(gain) * kp / abs(gear)  # a gear may turn the motor the other way round
         model.actuator_biastype[one] = int(mujoco.mjtBias.mjBIAS_AFFINE)
-        model.actuator_gainprm[one, 0] = gain * kp / gear
-        model.actuator_biasprm[one, :3] = 0.0, 0.0, -gain * kp / gear
+        model.actuator_gainprm[one, 0] = slope
+        model.actuator_biasprm[one, :3] = 0.0, 0.0, -slope
         if nominal.actuator_ctrllimited[one]:
             limits = np.sort(nominal.actuator_ctrlrange[one] * gain)
             if nominal.actuator_forcelimited[one]:

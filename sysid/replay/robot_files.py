@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from sysid.replay import xacro_text
+from sysid.replay.urdf_links import complete_links
 from sysid.replay.xacro_text import around, package_folders
 from whill_mjx.io.reading import LONGEST_REASON, MB, decoded, read_bytes
 
@@ -37,15 +38,15 @@ def read_robot(
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
     """
     text = decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF, URDF or xacro file."))
-    text = expand_xacro(path) if path.suffix == ".xacro" else text
+    text, left_out = expand_xacro(path) if path.suffix == ".xacro" else (text, [])
     try:
         top = ElementTree.fromstring(text)
     except ElementTree.ParseError:
         return mujoco.MjSpec.from_file(str(path)), [], None  # MuJoCo says where the mistake is
     if top.tag != "robot":
         spec = mujoco.MjSpec.from_string(text) if path.suffix == ".xacro" else mujoco.MjSpec.from_file(str(path))
-        return spec, _place_meshes(path, spec), None
-    notes = _place_urdf_meshes(path, top, wheels, wheel_radius)
+        return spec, [*left_out, *_place_meshes(path, spec)], None
+    notes = [*left_out, *complete_links(path, top), *_place_urdf_meshes(path, top, wheels, wheel_radius)]
     return mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode")), notes, _frictions(top)
 
 
@@ -61,8 +62,11 @@ def _frictions(top: ElementTree.Element) -> dict[str, float]:
     return found
 
 
-def expand_xacro(path: Path) -> str:
-    """Text of a xacro file with all macros expanded, in a process of its own: what stands in it may never end."""
+def expand_xacro(path: Path) -> tuple[str, list[str]]:
+    """Text of a xacro file with all macros expanded, and a note on each file of another package that is missing.
+
+    A process of its own does it: what stands in the file may never end.
+    """
     if importlib.util.find_spec("xacro") is None:
         raise ValueError(f"{path}: xacro files need the package xacro. Install it: {XACRO}; or expand the file where "
                          "you have ROS: xacro FILE > robot.urdf.")
@@ -73,13 +77,15 @@ def expand_xacro(path: Path) -> str:
         )  # fmt: skip
         said = done.stdout.decode("utf-8", errors="replace")
         if done.returncode == 0:
-            return said
+            lines = done.stderr.decode("utf-8", errors="replace").splitlines()
+            found = [one.removeprefix(xacro_text.LEFT_OUT) for one in lines if one.startswith(xacro_text.LEFT_OUT)]
+            return said, [f"{path.name}: {one}" for one in found]
         limit = f"it takes more than {xacro_text.SECONDS} s of processor time"
         reason = said[:LONGEST_REASON] if done.returncode == 1 else limit
     except subprocess.TimeoutExpired:
         reason = f"it is not done after {LONGEST} s"
     raise ValueError(f"{path}: xacro cannot expand it: {reason}. Correct the file, or expand it where you have ROS: "
-                     "xacro FILE > robot.urdf.")
+                     "xacro FILE ARGUMENT:=VALUE > robot.urdf.")
 
 
 def find_mesh(folder: Path, name: str) -> Path | None:

@@ -11,14 +11,25 @@ import mujoco
 import numpy as np
 
 from sysid.replay.robot import Robot
-from sysid.replay.robot_contacts import as_in_gazebo, below_wheels, leave_out_contacts, radius_of
+from sysid.replay.robot_contacts import as_in_gazebo, as_round_wheels, below_wheels, leave_out_contacts, radius_of
 from sysid.replay.robot_files import read_robot
 from sysid.replay.robot_rest import NEAR, near_floor, raise_supports, settle, sliding
-from sysid.replay.robot_servos import add_servos, are_motors, drive_gain, integrals, is_stable, regulate, wheel_inertias
+from sysid.replay.robot_servos import (
+    add_servos,
+    are_motors,
+    drive_gain,
+    drop_others,
+    integrals,
+    is_stable,
+    regulate,
+    wheel_inertias,
+)
 from sysid.replay.wheels import wheel_joints
 from whill_mjx.io.fields import Field, check
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
+WHEEL_RADIUS = Field("wheel radius", "m", 1e-3, 2.0,
+                     remedy='Sizes are in metres; a mesh in millimetres needs scale="0.001 0.001 0.001".')
 STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
 SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
 URDF_STEP = 0.0025  # s; a URDF states none
@@ -35,6 +46,7 @@ def load_robot(
     try:
         draft = _read(path, wheels, wheel_radius, timestep)
         radius = float(radius_of(path, draft.host, draft.bodies[0]) if wheel_radius is None else wheel_radius)
+        check(str(path), WHEEL_RADIUS, round(radius, 6))
         bare = _drive(draft, radius, regulated)
         _ground(draft, radius)
     except (ValueError, KeyError, mujoco.FatalError, mujoco.UnexpectedError) as error:
@@ -102,12 +114,16 @@ def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timeste
             spec.option.impratio, spec.option.cone = STIFF, mujoco.mjtCone.mjCONE_ELLIPTIC
         notes += as_in_gazebo(path, spec, joints)
         spec.option.timestep = URDF_STEP
+    notes += drop_others(path, spec, joints)
     _complete(path, spec, joints)
     if timestep is not None:
         spec.option.timestep = timestep
     check(str(path), TIMESTEP, float(spec.option.timestep))
     draft = _Draft(path, spec, joints, stated, notes)
     draft.compile()
+    if stated is not None and (rounded := as_round_wheels(path, spec, draft.host, draft.bodies)):
+        notes += rounded
+        draft.compile()
     return draft
 
 
@@ -156,7 +172,8 @@ def _rest(draft: _Draft, speed: int, turning: Sequence[int], radius: float) -> t
         mujoco.mj_resetData(host, data)
         settle(path, host, data, speed, turning, radius)
     for geom in {*supports, *sliding(host, data, root, swivelling=True)}:
-        friction = min(draft.stated.get(host.body(host.geom_bodyid[geom]).name, SLIDING), 1.0)
+        name = host.body(host.geom_bodyid[geom]).name
+        friction = min(draft.stated.get(name, 0.0) or SLIDING, 1.0)  # authors write 0 for a caster that rolls
         host.geom_friction[geom, 0] = friction
         spec.geom(host.geom(geom).name).friction[0] = friction
     return sliding(host, data, root)

@@ -30,6 +30,20 @@ def wheel_inertias(host: mujoco.MjModel, joint: int, radius: float, count: int) 
     return wheel, wheel + float(host.body_subtreemass[host.body_rootid[body]]) * radius**2 / count
 
 
+def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
+    """Remove actuators of the wheels that take neither a torque nor a speed, and those on tendons, a note for each."""
+    notes = []
+    for one in list(spec.actuators):
+        on_tendon = one.trntype == mujoco.mjtTrn.mjTRN_TENDON
+        motor = one.biastype == mujoco.mjtBias.mjBIAS_NONE
+        speed = one.biasprm[1] == 0 and one.biasprm[2] < 0 or one.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
+        if on_tendon or (one.target in joints and not motor and not speed):
+            what = f"acts on tendon {one.target}" if on_tendon else f"holds an angle of {one.target}"
+            notes.append(f"{path.name}: actuator {one.name} {what}: servos on the wheels stand in for it")
+            spec.delete(one)
+    return notes
+
+
 def add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> list[int]:
     """Give velocity servos to wheels without actuators; numbers of these wheels.
 

@@ -54,7 +54,7 @@ def vehicle_of(
     if ahead.min() < 0 < ahead.max():
         return "it stands on supports before and behind its axle"
     support = float(ahead.mean())
-    low, high = _extent(robot)
+    low, high = extent_of(robot)
     length, width, height = (high - low).tolist()
     spec = replace(spec, mass=mass, drive="differential", driven_axle="rear" if support > 0 else "front",
                    wheelbase=abs(support), rear_axle_x=min(support, 0.0) - float(low[0] + high[0]) / 2,
@@ -111,7 +111,7 @@ def _at_rest(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.nda
     return mass, centre, float(inertia), supports, float(np.clip(centre[0] / supports.mean(), 0.0, 1.0))
 
 
-def _extent(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+def extent_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest place (3,) of its geoms at rest: ahead of the driven axle's middle, to the left and up [m]."""
     host, data = robot.host, mujoco.MjData(robot.host)
     data.qpos[:] = robot.rest

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,12 @@ PASSIVE = re.compile(r"cast[eo]r|swivel|ball|idler|passive|steer|omni|roller|for
 """Words in the names of what rolls along, or turns another wheel about the vertical."""
 LEFT = {"left", "l", "fl", "rl", "bl", "ml", "lf", "lr", "lb", "lm", "lh"}
 RIGHT = {"right", "r", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh"}
+WHEEL = re.compile(r"wheel|tyre|tire|whl", re.I)
 MOST = 3  # wheels on each side
+LEVEL = 0.5  # of an axis along the vertical, or less than which it does not lie across
+UPRIGHT = 0.9  # of an axis along the vertical, from which it steers
+SWIVELS = np.radians(300.0)  # range of a hinge from which a caster turns on it
+MANY_TURNS = 200 * np.pi  # rad of a range that is no end
 
 
 def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...]:
@@ -37,55 +43,116 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...
                              f"their actuators, left and right, or four or six of a skid-steered robot "
                              f"(joints: {', '.join(hinges)}; actuators: {', '.join(driven)}).")
         return (found[0], found[1]) if len(found) == 2 else _paired(path, spec, found)
+    standing = _standing(spec, hinges)
+    if standing is not None:
+        _refuse_steering(path, spec, hinges, standing)
     pulled = [name for name in hinges if name in driven.values()]
     for among in (pulled, list(hinges)):
         sides = [[name for name in among if side in name.lower()] for side in ("left", "right")]
         if all(len(side) == 1 for side in sides):
             return sides[0][0], sides[1][0]
     rolling = [name for name, joint in hinges.items() if _rolls(joint)]
-    wheels_alone = [name for name in rolling if not PASSIVE.search(f"{name} {hinges[name].parent.name}")]
-    for names in ([name for name in pulled if name in rolling], wheels_alone, rolling):
-        sided = all(map(_side, names)) if len(names) == 2 else len(names) in (4, 6)
-        if sided and (in_order := _by_side(spec, names)) is not None:
+    active = [name for name in hinges if not PASSIVE.search(f"{name} {hinges[name].parent.name}")]
+    wheels_alone = [name for name in rolling if name in active]
+    level = [name for name in active if standing and name in standing and standing[name].is_wheel]
+    for names in ([name for name in pulled if name in rolling], wheels_alone, rolling, level):
+        if len(names) in (2, 4, 6) and standing is not None and (in_order := _by_side(standing, names)) is not None:
             return in_order
+    axles = [name for name in hinges if standing and standing[name].is_wheel]
+    if standing and len(axles) > 2 and len({standing[name].direction for name in axles}) > 1:
+        raise ValueError(f"{path}: the axles of its wheels ({', '.join(axles)}) point in different "
+                         "directions: it is no differential or skid-steered robot. Fit a function of your own "
+                         "(docs/models.md), or name the wheels that drive with --wheels.")
+    if not hinges:
+        raise ValueError(f"{path}: no joint turns, so it has no wheels. The joints of wheels are of type continuous in "
+                         "a URDF, hinge in MJCF.")
     raise ValueError(f"{path}: the names do not show which wheels are driven (joints: {', '.join(hinges)}). Name "
                      "them: wheels=(left, right), on the command line --wheels LEFT RIGHT, or all four or six.")
 
 
-def _rolls(joint: Any) -> bool:
-    """Whether a hinge has no end and is of a wheel by its name, or that of its body."""
-    limited = joint.limited == mujoco.mjtLimited.mjLIMITED_TRUE or bool(np.ptp(joint.range))
-    return not limited and re.search(r"wheel|tyre|tire|whl", f"{joint.name} {joint.parent.name}", re.I) is not None
+@dataclass(frozen=True)
+class _Stand:
+    """Where a hinge stands in the chassis's frame."""
+
+    place: np.ndarray  # (3,) m
+    axis: np.ndarray  # (3,)
+    is_wheel: bool
+    """Whether it turns without an end about a level axis across the chassis, and hangs on no other hinge."""
+
+    @property
+    def direction(self) -> int:
+        """Of a level axle, either way [10 degrees]."""
+        return round(float(np.degrees(np.arctan2(self.axis[1], self.axis[0]))) / 10) % 18
 
 
-def _paired(path: Path, spec: Any, names: Sequence[str]) -> tuple[str, ...]:
-    found = _by_side(spec, names)
-    if found is None:
-        raise ValueError(f"{path}: wheels {', '.join(names)} do not stand in pairs, one left and one right. Name the "
-                         "driven wheels of both sides.")
-    return found
-
-
-def _by_side(spec: Any, names: Sequence[str]) -> tuple[str, ...] | None:
-    """Left ones, then right ones, both from front to rear; None where they do not stand in pairs with level axles."""
+def _standing(spec: Any, hinges: Mapping[str, Any]) -> dict[str, _Stand] | None:
+    """Where hinges stand by name; None for a model that does not compile."""
     try:
         model = spec.copy().compile()
     except (ValueError, mujoco.FatalError):
         return None
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    ids = [model.joint(name).id for name in names]
-    wheel = int(model.jnt_bodyid[ids[0]])
-    root = int(model.body_rootid[wheel])
-    root = 0 if root == wheel else root  # the chassis of a URDF is part of the world until it gets a free joint
-    turn = data.xmat[root].reshape(3, 3)
-    place = (data.xanchor[ids] - data.xpos[root]) @ turn
-    if (np.abs((data.xaxis[ids] @ turn)[:, 2]) > 0.5).any():
+    found = {}
+    for name, joint in hinges.items():
+        number = model.joint(name).id
+        body = int(model.jnt_bodyid[number])
+        root = int(model.body_rootid[body])
+        root = 0 if root == body else root  # the chassis of a URDF is part of the world until it gets a free joint
+        turn = data.xmat[root].reshape(3, 3)
+        axis, above = data.xaxis[number] @ turn, int(model.body_parentid[body])
+        hangs = int(model.body_weldid[above]) not in (0, int(model.body_weldid[root]))
+        found[name] = _Stand((data.xanchor[number] - data.xpos[root]) @ turn, axis,
+                             not _has_end(joint) and not hangs and abs(float(axis[2])) < LEVEL)
+    return found
+
+
+def _refuse_steering(path: Path, spec: Any, hinges: Mapping[str, Any], standing: Mapping[str, _Stand]) -> None:
+    """Refuse wheels that are steered: what turns them is not in the file, and held straight they would skid."""
+    steered = {joint.parent.name: name for name, joint in hinges.items()
+               if _has_end(joint) and np.ptp(joint.range) < SWIVELS and abs(float(standing[name].axis[2])) > UPRIGHT}
+    for name, joint in hinges.items():
+        above = joint.parent.parent
+        while _rolls(joint) and above.name != "world":
+            if above.name in steered:
+                raise ValueError(f"{path}: wheel {name} is steered by joint {steered[above.name]}; robots that steer "
+                                 "as cars do are not read. Fit a function of your own (docs/models.md), or name the "
+                                 "wheels that drive with --wheels to hold the steering straight.")
+            above = above.parent
+
+
+def _has_end(joint: Any) -> bool:
+    """Whether a hinge turns less than a hundred turns."""
+    return bool(0 < np.ptp(joint.range) < MANY_TURNS) and joint.limited != mujoco.mjtLimited.mjLIMITED_FALSE
+
+
+def _rolls(joint: Any) -> bool:
+    """Whether a hinge has no end and is of a wheel by its name, or that of its body."""
+    return not _has_end(joint) and WHEEL.search(f"{joint.name} {joint.parent.name}") is not None
+
+
+def _paired(path: Path, spec: Any, names: Sequence[str]) -> tuple[str, ...]:
+    standing = _standing(spec, {name: spec.joint(name) for name in names})
+    found = None if standing is None else _by_side(standing, names)
+    if found is None:
+        raise ValueError(f"{path}: wheels {', '.join(names)} do not stand in pairs, one left and one right. Name the "
+                         "driven wheels of both sides.")
+    return found
+
+
+def _by_side(standing: Mapping[str, _Stand], names: Sequence[str]) -> tuple[str, ...] | None:
+    """Left ones, then right ones, both from front to rear; None where they do not stand in pairs with level axles."""
+    ours = [standing[name] for name in names]
+    place = np.array([one.place for one in ours])
+    across = [abs(float(one.axis[1])) > LEVEL for one in ours]
+    named = all(map(_side, names))
+    if any(abs(float(one.axis[2])) > LEVEL for one in ours) or not (named or all(across)):
         return None
     sides = [_side(name) or (1 if y > place[:, 1].mean() else -1) for name, y in zip(names, place[:, 1], strict=True)]
+    if len(names) == 2 and not named and abs(place[0, 1] - place[1, 1]) < np.abs(place[0] - place[1]).max():
+        return None  # one behind the other
     order = sorted(range(len(names)), key=lambda i: (-sides[i], -place[i, 0]))
-    ok = sum(sides) == 0 and len(names) // 2 <= MOST
-    return tuple(names[i] for i in order) if ok else None
+    return tuple(names[i] for i in order) if sum(sides) == 0 and len(names) // 2 <= MOST else None
 
 
 def _side(name: str) -> int:

@@ -1,6 +1,7 @@
 """Expands a xacro file in a process of its own: `python xacro_text.py FILE SECONDS`. What stands in it may never end.
 
 Prints the text, or, with exit code 1, what is wrong. `$(find PACKAGE)` also looks in the folders around the file.
+Files that other packages would include, and their macros, are left out; the error stream has a line for each.
 """
 
 from __future__ import annotations
@@ -8,7 +9,10 @@ from __future__ import annotations
 import resource
 import sys
 from pathlib import Path
+from typing import Any
 
+LEFT_OUT = "left out: "
+"""Begins a line of what was left out."""
 PARENTS = 4  # folders above the file in which packages are looked for
 SECONDS, BYTES = 10, 1_500_000_000  # processor time and memory; an arm with all its macros takes a second
 
@@ -26,34 +30,53 @@ def package_folders(folder: Path, package: str) -> list[Path]:
     return found
 
 
-def expand(path: Path) -> str:
-    """The text; errors are those of xacro, which have no common class."""
+def expand(path: Path, left_out: list[str]) -> str:
+    """The text; what is left out is added to a list. Errors are those of xacro, which have no common class."""
     import xacro
     from xacro import substitution_args
 
     installed, folder = substitution_args._eval_find, path.resolve().parent
+    include, call = xacro.process_include, xacro.handle_macro_call
 
     def find(package: str) -> str:
         try:
             return str(installed(package))
         except Exception:  # of ROS where it is not sourced, or lacks the package
-            for place in package_folders(folder, package):
-                return str(place)
-            raise ValueError(f"package {package!r} is neither installed nor a folder around the file") from None
+            return next(map(str, package_folders(folder, package)), f"package://{package}")
 
-    substitution_args._eval_find = find
+    def included(element: Any, macros: Any, symbols: Any, evaluate: Any) -> None:
+        name = str(xacro.eval_text(element.getAttribute("filename"), symbols))
+        if not name.startswith("package://"):
+            include(element, macros, symbols, evaluate)
+            return
+        left_out.append(f"{name} is not found: what it includes is left out")
+        xacro.replace_node(element, by=None)
+
+    def called(node: Any, macros: Any, symbols: Any) -> bool:
+        try:
+            return bool(call(node, macros, symbols))
+        except xacro.XacroException as error:
+            if not left_out or f"unknown macro name: {node.tagName}" not in str(error):
+                raise
+        left_out.append(f"macro {node.tagName} is left out with its file")
+        xacro.replace_node(node, by=None)
+        return True
+
+    substitution_args._eval_find, xacro.process_include, xacro.handle_macro_call = find, included, called
     return str(xacro.process_file(str(path)).toxml())
 
 
 def main() -> int:
     """Expand within the limits."""
-    seconds = int(sys.argv[2])
+    seconds, left_out = int(sys.argv[2]), list[str]()
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     resource.setrlimit(resource.RLIMIT_AS, (BYTES, BYTES))
     try:
-        text, code = expand(Path(sys.argv[1])), 0
+        text, code = expand(Path(sys.argv[1]), left_out), 0
+        sys.stderr.writelines(f"{LEFT_OUT}{one}\n" for one in left_out)
     except BaseException as error:
-        text, code = " ".join(str(error).split()) or type(error).__name__, 1
+        said = " ".join(str(error).split()) or type(error).__name__
+        text, code = "; ".join([said, *left_out]), 1
     sys.stdout.buffer.write(text.encode("utf-8", errors="replace"))
     return code
 

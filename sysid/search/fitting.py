@@ -133,7 +133,7 @@ def fit_log(
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
     known = uncertainty.estimate(chosen, u, robust=robust)
     traced = profile(chosen, Minimum(u, known, config.robust), wanted, progress=progress) if wanted else []
-    if config.calibrate and config.vehicle is None and config.method not in GLOBAL:
+    if config.calibrate and not config.all_sizes and config.vehicle is None and config.method not in GLOBAL:
         if progress is not None:
             progress(0, "sizes: stated or free")
         sizes = chosen_sizes(chosen, objective.renewed(u), known, final_cost, config.parameters, robust)

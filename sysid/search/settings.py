@@ -57,6 +57,8 @@ class FitConfig:
     calibrate: bool = True
     """Whether wheel radii, track, scales of the odometry and the tracked point are fitted as well, where an outside
     pose shows them and drives that are held back come out better so."""
+    all_sizes: bool = False
+    """Keep all of these free, also where drives that are held back do not need them."""
     profile: tuple[str, ...] = ()
     """Parameters whose profile likelihood is traced, or `all`: each takes a search of its own."""
     physics_dt: Annotated[float, PHYSICS_DT] = 0.0025

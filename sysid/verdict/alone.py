@@ -19,8 +19,9 @@ from collections.abc import Sequence
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import EFFORT, LARGEST, PairScan, Search, missing
-from sysid.verdict.rounds import NOTHING, Asked, candidates_of, class_of, held_back
+from sysid.verdict.found import EFFORT, LARGEST, PairScan, Search
+from sysid.verdict.posterior import NOTHING, missing
+from sysid.verdict.rounds import Asked, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
 
 UNTOLD = "neither replicates nor reference drives show the noise, so whether anything else is missing is unknown"
@@ -43,7 +44,7 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
     found = Search("none", asked.base, asked.base, asked.scan)
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
-    against, unseen = "what stands out in a linear scan does not hold in a refit", ""
+    against, unseen, hidden = "what stands out in a linear scan does not hold in a refit", "", 0.0
     while len(found.accepted) < EFFORT.rounds and len(found.rounds) < 2 * EFFORT.rounds:
         candidates = candidates_of(asked, found, found.final)
         likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
@@ -58,6 +59,7 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
         shown = [one for one in as_good if wheels or card_of(one.hypothesis.effect).shown_by_pose]
         if not shown:
             unseen = unseen or best.hypothesis.effect
+            hidden += best.share - asked.explained(found.final)  # what has no name is no part of what names explain
             found.final = best.refit
             continue
         taken_on = min(shown, key=lambda one: len(one.hypothesis.axes))
@@ -66,7 +68,7 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
         found.accepted.append(taken_on)
         taken = {one.hypothesis.effect for one in found.accepted}
         found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])
-        found.final, found.share = taken_on.refit, taken_on.share
+        found.final, found.share = taken_on.refit, taken_on.share - hidden
     lacking = unseen and f"{unseen} stands out, but without odometry nothing shows what wheels did: log their speeds"
     if found.accepted:
         found.verdict = "named"

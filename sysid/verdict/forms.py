@@ -1,4 +1,4 @@
-"""A further effect beside other forms of those before it.
+"""Effects beside other forms of each other.
 
 No vehicle follows the catalogue's laws exactly. What such a law leaves is again the effect's own signature, only larger
 or smaller with speed, turning, time or manoeuvre, or earlier or later. Every effect may therefore have another form,
@@ -21,47 +21,88 @@ RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
-class Beside:
-    """The last effect of a joint fit beside other forms of those before it."""
+class Forms:
+    """A joint fit of M effects whose forms may be others. Base parameters and sizes move linearly around the fit."""
 
-    gain: float
-    """By how much it lowers the cost there."""
-    residual: np.ndarray  # (B, n) what is left where every effect may have another form
+    target: np.ndarray  # (n,) white residual, and what base parameters moved by
+    base: np.ndarray  # (n, P) columns of the base parameters
+    sizes: tuple[np.ndarray, ...]  # per effect (n, k): columns of its coordinates
+    changes: tuple[np.ndarray, ...]  # per effect (n,): what it changes altogether
+    bent: tuple[np.ndarray, ...]  # per effect (n, m): the same in other forms, together as large as it is
+    precision: np.ndarray  # (P, P) of the base parameters
+    shape: tuple[int, ...]  # (B, n / B) of the residual
+
+    def left(self, form: float) -> np.ndarray:
+        """(B, n / B) what is left where all effects may have other forms.
+
+        Args:
+            form: root mean square of all forms of an effect together, as a share of what it changes.
+        """
+        columns = [self.base, *self.sizes]
+        solution, design = self._solved(columns, self.bent, form, self.target)
+        return (self.target - design @ solution).reshape(self.shape)
+
+    def gain(self, form: float, number: int, groups: Sequence[Sequence[int]]) -> tuple[float, np.ndarray]:
+        """By how much one of the effects, in the form of its law, lowers the cost beside other forms of the others.
+
+        It is taken away whole: columns around its size say little of a dead zone or a limit without it.
+
+        Returns:
+            The gain on all drives, and on each manoeuvre (G,) with all sizes fitted to the others.
+        """
+        target = self.target + self.changes[number]
+        others = [one for i, one in enumerate(self.sizes) if i != number]
+        bent = [one for i, one in enumerate(self.bent) if i != number]
+        costs, apart = [], []
+        for mine in ([], [self.changes[number][:, None]]):
+            columns = [self.base, *others, *mine]
+            solution, design = self._solved(columns, bent, form, target)
+            costs.append(float(target @ target - target @ design @ solution))
+            apart.append(self._left_out(design, self._prior(columns, bent, form), target, groups))
+        return max(costs[0] - costs[1], 0.0), apart[0] - apart[1]
+
+    def _prior(self, plain: Sequence[np.ndarray], bent: Sequence[np.ndarray], form: float) -> np.ndarray:
+        """(F, F) precision of the columns."""
+        sizes = [sum(one.shape[1] for one in each) for each in (plain, bent)]
+        prior = np.diag(np.repeat([0.0, form**-2], sizes))
+        prior[: len(self.precision), : len(self.precision)] = self.precision
+        return prior
+
+    def _solved(self, plain: Sequence[np.ndarray], bent: Sequence[np.ndarray], form: float, target: np.ndarray
+                ) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (F,) of least cost, and the columns (n, F)."""
+        design = np.concatenate([*plain, *bent], axis=1)
+        return _solve(design.T @ design + self._prior(plain, bent, form), design.T @ target), design
+
+    def _left_out(self, design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: Sequence[Sequence[int]]
+                  ) -> np.ndarray:
+        """(G,) squared residual of each manoeuvre, with coefficients fitted to the others."""
+        matrix, right, out = design.T @ design + prior, design.T @ target, []
+        columns, aim = design.reshape(self.shape[0], -1, design.shape[1]), target.reshape(self.shape[0], -1)
+        for group in groups:
+            x, y = columns[list(group)].reshape(-1, design.shape[1]), aim[list(group)].reshape(-1)
+            out.append(float(np.square(y - x @ _solve(matrix - x.T @ x, right - x.T @ y)).sum()))
+        return np.array(out)
 
 
-def beside_forms(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]], form: float) -> Beside:
-    """Let the effects of a joint fit have other forms. Base parameters and sizes move linearly around the fit; the last
-    effect is taken away whole, since its columns say little of a dead zone or a limit without it.
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution of equations that may be dependent."""
+    return np.linalg.solve(matrix + RIDGE * max(float(np.trace(matrix)), 1e-9) * np.eye(len(matrix)), right)
 
-    Args:
-        groups: trials of each manoeuvre.
-        form: root mean square of all forms of an effect together, as a share of what it changes.
-    """
+
+def forms_of(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:
+    """Other forms of the effects of a joint fit; `groups` has the trials of each manoeuvre."""
     whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
     changes = [refitter.white(whole - one) for one in less]
     bent = [refitter.white(modulated(whole - one, whole, groups)) for one in less]
     bent = [one * (np.square(change).sum() / max(np.square(one).sum(), 1e-12)) ** 0.5
             for one, change in zip(bent, changes, strict=True)]
-    size, last = len(fit.u), len(fit.u) + fit.parts[-1].start
-    columns, mine = fit.jacobian.reshape(-1, fit.jacobian.shape[-1]), changes[-1].reshape(-1, 1)
-    target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u) + mine[:, 0]
-    forms = np.concatenate([one.reshape(len(columns), -1) for one in bent], axis=1)
-    before = forms[:, : sum(one.shape[-1] for one in bent[:-1])]
-    columns = np.concatenate([columns, mine], axis=1)
-
-    def ridge(effects: np.ndarray, others: np.ndarray) -> tuple[float, np.ndarray]:
-        """Least cost of the target, and what is then left (n,)."""
-        design = np.concatenate([effects, others], axis=1)
-        prior = np.diag(np.repeat([0.0, form**-2], [effects.shape[1], others.shape[1]]))
-        prior[:size, :size] = refitter.precision
-        matrix = design.T @ design + prior
-        matrix[np.diag_indices(len(matrix))] += RIDGE * max(float(np.trace(matrix)), 1e-9)
-        right = design.T @ target
-        solution = np.linalg.solve(matrix, right)
-        return float(target @ target - right @ solution), target - design @ solution
-
-    gain = ridge(columns[:, :last], before)[0] - ridge(columns, before)[0]
-    return Beside(max(gain, 0.0), ridge(columns, forms)[1].reshape(fit.residual.shape))
+    size, count = len(fit.u), fit.residual.size
+    columns = fit.jacobian.reshape(count, -1)
+    target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u)
+    return Forms(target, columns[:, :size], tuple(columns[:, size + one.start : size + one.stop] for one in fit.parts),
+                 tuple(one.reshape(-1) for one in changes), tuple(one.reshape(count, -1) for one in bent),
+                 refitter.precision, fit.residual.shape)
 
 
 def modulated(change: np.ndarray, motion: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:

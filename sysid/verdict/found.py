@@ -1,40 +1,17 @@
-"""What the search for effects decides by, and what it found."""
+"""What the search for effects found."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.joint_fit import Refit
+from sysid.verdict.posterior import Findings, Thresholds, posterior
 
 LARGEST = 4  # members of a class
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """What decides. Frozen before any drive is looked at; part of the manifest."""
-
-    alpha: float = 0.005
-    """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
-    the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
-    alarms. Of two effects the one whose posterior weight is a smaller share of the other's is not in its class."""
-    form: float = 0.5
-    """Standard deviation of an effect's form from the catalogue's law, as a share of its size."""
-    share: float = 0.6
-    """Least share that effects explain of what they explain and what is then left that replicates share, or that smooth
-    functions predict."""
-    doubt: float = 1e-10
-    """p-value of the search below which something without a name is missing, whatever the excess. Small p-values come
-    more often than they should: on 420 days with nothing missing the least one without such an excess was 8e-10."""
-
-    @property
-    def alike(self) -> float:
-        """|cos| of two effects' signatures above which another form of one may be the other."""
-        return (1 + self.form**2) ** -0.5
 
 
 @dataclass(frozen=True)
@@ -45,6 +22,8 @@ class Effort:
     """Effects that are searched for one after the other, at most."""
     candidates: int = 4
     """Effects refitted in a round, of each scan; pairs refitted; effects that might imitate the best one."""
+    weighed: int = 2
+    """Sets of a round that are weighed, at most: those that gain most."""
 
 
 EFFORT = Effort()
@@ -81,10 +60,19 @@ class Search:
     """Squared white residual over its number, less 1: before and after."""
     reason: str = ""
     pairs: PairScan | None = None
-    steps: list[dict[str, Any]] = field(default_factory=list)
-    """The numbers behind each step."""
     together: float | None = None
     """Where two effects were accepted as a pair: the p-value of the scan of pairs, or of the weaker one's refit."""
+    findings: Findings | None = None
+    """The numbers that the verdict was reached from; None for drives that stand alone."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """Posterior weights (`sysid.verdict.posterior.Posterior`)."""
+
+    def judged(self, findings: Findings, thresholds: Thresholds) -> Search:
+        """This search, with the verdict that its findings come to."""
+        weighed = posterior(findings, thresholds)
+        self.findings, self.weights = findings, weighed.weights
+        self.verdict, self.share, self.reason = weighed.verdict, weighed.share, weighed.reason
+        return self
 
     @property
     def p_value(self) -> float:
@@ -93,13 +81,6 @@ class Search:
             return self.together
         refitted = min((one.p for one in self.rounds[0]), default=0.0) if self.rounds else 0.0
         return max(self.scan.p_family, refitted)
-
-
-def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
-    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt. The
-    excess alone is one of five looks at the drives."""
-    both = max(search_p, excess_p) < thresholds.alpha
-    return both or excess_p < thresholds.alpha / 5 or search_p < thresholds.doubt
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from sysid.logs.records import Trial
 from sysid.missing.refit import Refitter
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsification import put_to_test
-from sysid.verdict.found import Search, Thresholds
+from sysid.verdict.found import Search
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import Stood
 
 
@@ -29,6 +30,10 @@ def stand(
 
 def guarded(found: Search, stood: Sequence[Stood], thresholds: Thresholds) -> Search:
     """The search without a name where one of its effects is contradicted."""
+    if found.findings is not None:
+        names = tuple(one.hypothesis.effect for one in found.accepted)
+        return found.judged(found.findings.put_to_test(names, [
+            each for one in stood for each in one.against(thresholds)]), thresholds)
     named = {one.hypothesis.effect for one in found.accepted}
     against = [each for one in stood if one.effect in named for each in one.against(thresholds)]
     if against:

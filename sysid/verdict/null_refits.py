@@ -20,8 +20,9 @@ from sysid.missing.refit import ITERATIONS, Refitter, side_by_side
 from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
-from sysid.verdict.found import NullRefits, PairScan, Search, Thresholds, tail
+from sysid.verdict.found import NullRefits, PairScan, Search, tail
 from sysid.verdict.pairs import scan_again
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import best, drawn_away
 
@@ -48,7 +49,7 @@ def run(
         around = at_fit(asked.evidence, base.residual, base.jacobian, base.u - reference.u)
         gain, worth, q = best(Solver(around), hypotheses, wander)
         p_each = np.array([tail(scan.null[:, h], worth[h]) for h in range(len(hypotheses))])
-        day = replace(asked, evidence=around, refitter=one, base=base, far=None, steps=[], report=lambda _: None,
+        day = replace(asked, evidence=around, refitter=one, base=base, far=None, report=lambda _: None,
                       scan=replace(scan, gain=gain, worth=worth, q=q, p=p_each))
         found = judge(day, None if pairs is None else scan_again(pairs, around, hypotheses, wander))
         p[n] = found.p_value

@@ -80,9 +80,12 @@ def find_missing(
         judge = partial(search_alone, wheels=any(trial.odometry is not None for trial in log.training))
     pairs = None if alone else pairs_of(asked, config.seed)
     outcome = judge(asked, pairs)
+    if outcome.findings is not None and noise is not None:
+        other = tuple(name for name, one in noise.report().items() if one["changed"])
+        outcome = outcome.judged(replace(outcome.findings, noise=other), config.thresholds)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(replace(asked, wander=usual.wander, steps=[]), judge, pairs, config.refit_nulls,
+        nulls = run_null_refits(replace(asked, wander=usual.wander), judge, pairs, config.refit_nulls,
                                 config.seed, progress)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
     stood: tuple[Stood, ...] = ()

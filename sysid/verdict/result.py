@@ -19,7 +19,8 @@ from sysid.replay.records import Plant
 from sysid.replay.rollout import PathReplay
 from sysid.verdict.agreement import Heterogeneity
 from sysid.verdict.falsifiers import Tested, in_words
-from sysid.verdict.found import NullRefits, Search, Thresholds
+from sysid.verdict.found import NullRefits, Search
+from sysid.verdict.posterior import Thresholds
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
 

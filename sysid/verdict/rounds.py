@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -17,11 +16,10 @@ from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
 from sysid.verdict.agreement import beside, foretold
 from sysid.verdict.classes import imitation
-from sysid.verdict.forms import Beside, beside_forms
-from sysid.verdict.found import EFFORT, Candidate, Scan, Search, Thresholds
+from sysid.verdict.found import EFFORT, Candidate, PairScan, Scan, Search
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.scan import best, run
 
-NOTHING = "nothing stands out of the noise and the day-to-day spread"
 FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
 ELSEWHERE = (1.0, 3.0)
 """Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
@@ -52,8 +50,6 @@ class Asked:
     """Says what was just done."""
     far: Looked | None = None
     """A scan around the reference: a large effect shows best there."""
-    steps: list[dict[str, Any]] = field(default_factory=list)
-    """The numbers behind each step so far."""
 
     @cached_property
     def count(self) -> float:
@@ -72,51 +68,6 @@ class Asked:
         """Share of the base fit's excess that a fit removes; where there is hardly any, of what a day's varies by."""
         before = self.excess(self.base.residual)
         return float(np.clip((before - self.excess(fit.residual)) / max(before, self.wander.excess), 0.0, 1.0))
-
-    def share(self, fit: Refit, gain: float, residual: np.ndarray, random: float) -> float:
-        """What effects of a fit gain, as a share of that and of what they leave (B, n) though it could be predicted.
-
-        That is what replicates have in common, where it is more than days differ by, or what smooth functions predict
-        of drives that were held back, beyond a usual day's. What replicates do not share (gusts, say) nothing predicts:
-        a share of it counts (`random`).
-        """
-        wander, excess = self.wander, self.excess(residual)
-        common = excess - wander.unshared(residual, self.refitter.drives.repeats)
-        left = {"common": common * self.count, "any": random * excess * self.count}
-        p = {"common": wander.p_excess(common), "any": wander.p_excess(excess)}
-        most = max((left[name] for name in left if p[name] < self.thresholds.alpha), default=0.0)
-        if gain >= self.thresholds.share * (gain + most):  # else smooth functions change nothing
-            left["smooth"] = self.anything(residual) - wander.usual * len(residual)
-            most = max(most, left["smooth"])
-        share = gain / max(gain + most, 1e-9)
-        self.steps.append({"effects": [one.key for one in fit.hypotheses], "gain": gain, "left": left, "p": p,
-                           "share": share})
-        return share
-
-    def beside_forms(self, fit: Refit) -> Beside:
-        """The last effect of a joint fit beside other forms of those before it."""
-        return beside_forms(self.refitter, fit, self.evidence.groups, self.thresholds.form)
-
-    def calm(self, fit: Refit) -> bool:
-        """Whether other forms of the effects of a joint fit leave no more than days differ by, or nothing that smooth
-        functions predict better than on usual days."""
-        residual, limit = self.beside_forms(fit).residual, self.wander.smooth_limit(self.thresholds.alpha)
-        p = self.p_left(residual)
-        known = p < self.thresholds.alpha and np.isfinite(limit)  # whether smooth functions have a say
-        smooth = self.anything(residual) / len(residual) if known else None
-        self.steps.append({"effects": [one.key for one in fit.hypotheses], "p_left": self.p_left(fit.residual),
-                           "p_left_beside_forms": p, "smooth": smooth, "limit": limit if known else None})
-        return p >= self.thresholds.alpha or smooth is not None and smooth <= limit
-
-    def named(self, fit: Refit) -> float:
-        """Share of what could be predicted that the effects of a fit explain. They may act at random in part: in energy
-        `Thresholds.form` squared of what they leave so counts against them."""
-        return self.share(fit, self.base.cost - fit.cost, fit.residual, self.thresholds.form**2)
-
-    def own(self, fit: Refit) -> bool:
-        """Whether the last effect of a joint fit does more than to mend the form of those before it."""
-        found = self.beside_forms(fit)
-        return self.share(fit, found.gain, found.residual, 1.0) >= self.thresholds.share
 
 
 def begin(
@@ -270,31 +221,35 @@ def _widest(
 
 
 def candidate_of(asked: Asked, h: int, fit: Refit, current: Refit) -> Candidate:
-    """A refitted hypothesis with the p-value of its gain, less what such an effect gains on a day without it."""
-    one, evidence = asked.hypotheses[h], asked.evidence
+    """A refitted hypothesis with the p-value of its gain."""
     gain = max(current.cost - fit.cost, 0.0)
-    q = fit.q[-len(one.axes) :]
+    return Candidate(asked.hypotheses[h], gain, p_of_last(asked, fit, gain), asked.explained(fit), fit)
+
+
+def p_of_last(asked: Asked, fit: Refit, gain: float) -> float:
+    """Family-wise p-value of a gain by the last effect of a joint fit, less what it gains on a day without it."""
+    one, evidence = fit.hypotheses[-1], asked.evidence
+    h, q = asked.hypotheses.index(one), fit.q[-len(one.axes) :]
     inside = beside(fit.products(evidence.precision), len(q))
     moved = np.abs(q) > 1e-9
     inside, wide = (matrix[np.ix_(moved, moved)] for matrix in (inside, asked.wander.at(evidence.columns, h, q)))
     alone = float(q[moved] @ inside @ q[moved])
     whole = float(q[moved] @ np.linalg.pinv(np.linalg.pinv(inside) + wide) @ q[moved])
-    worth = gain * min(whole / alone, 1.0) if alone > 0 else 0.0
-    return Candidate(one, gain, asked.scan.p_of(h, worth), asked.explained(fit), fit)
+    return asked.scan.p_of(h, gain * min(whole / alone, 1.0) if alone > 0 else 0.0)
 
 
-def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
-    """Two effects instead of what was accepted, where only together they explain the drives.
-
-    Each must be significant and do more than to mend the form of the other, and together they must explain more than
-    what was accepted one by one.
+def pair_round(asked: Asked, pairs: PairScan, tried: set[str]) -> list[tuple[list[Candidate], float]]:
+    """Pairs that gain more together than any effect alone, refitted; the best first.
 
     Args:
         tried: effects whose pairs had their chance, with the other one as a further effect.
+
+    Returns:
+        Of each pair its two effects, the one that explains more by itself first and the refit of both last; and the
+        p-value of "nothing is missing".
     """
-    pairs, hypotheses, refitter, thresholds = found.pairs, asked.hypotheses, asked.refitter, asked.thresholds
-    assert pairs is not None
-    least = float(found.scan.gain.max()) if len(found.scan.gain) else 0.0
+    hypotheses, refitter, thresholds = asked.hypotheses, asked.refitter, asked.thresholds
+    least = float(asked.scan.gain.max()) if len(asked.scan.gain) else 0.0
     order, seen = [], set()
     for m in np.argsort(-pairs.gain):
         names = frozenset(hypotheses[h].effect for h in pairs.members[m])
@@ -302,29 +257,20 @@ def pair_round(asked: Asked, found: Search, tried: set[str]) -> None:
                 and pairs.p_of(float(pairs.p[m])) < thresholds.alpha):
             seen.add(names)
             order.append(int(m))
-    starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), found.base.u, pairs.q[m])
+    starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), asked.base.u, pairs.q[m])
               for m in order[: EFFORT.candidates]]
-    if not starts:
-        return
-    fits = refitter.fit_all(starts, FIRST_LOOK + POLISH)
-    both = min(fits, key=lambda fit: fit.cost)
-    alone = refitter.fit_all([Start((one,), both.u, q) for one, q in zip(both.hypotheses, both.split, strict=True)],
-                             POLISH)
-    if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
-        both, alone = moved_last(both, 0), alone[::-1]
-    if found.accepted and both.cost >= found.accepted[-1].refit.cost:
-        return
-    members = []
-    for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0])):
-        one = candidate_of(asked, hypotheses.index(fit.hypotheses[-1]), fit, other)
-        if one.p >= thresholds.alpha or not asked.own(fit):
-            return
-        members.append(one)
-    members[0] = replace(members[0], refit=alone[0], share=asked.explained(alone[0]))
-    found.accepted = members
-    found.classes = [class_of(asked, one, [one]) for one in members]
-    found.rounds += [[one] for one in members]
-    found.together = max(pairs.p_family, *(one.p for one in members))
+    out = []
+    for both in sorted(refitter.fit_all(starts, FIRST_LOOK + POLISH), key=lambda fit: fit.cost)[: EFFORT.weighed]:
+        alone = refitter.fit_all([Start((one,), both.u, q) for one, q in zip(both.hypotheses, both.split, strict=True)],
+                                 POLISH)
+        if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first
+            both, alone = moved_last(both, 0), alone[::-1]
+        members = [candidate_of(asked, hypotheses.index(fit.hypotheses[-1]), fit, other)
+                   for fit, other in ((moved_last(both, 0), alone[1]), (both, alone[0]))]
+        members[0] = replace(members[0], refit=alone[0], share=asked.explained(alone[0]))
+        out.append((members, max(pairs.p_family, *(one.p for one in members))))
+    asked.report("refits of pairs")
+    return out
 
 
 def held_back(asked: Asked, fit: Refit) -> np.ndarray:
@@ -344,7 +290,7 @@ def class_of(asked: Asked, best: Candidate, candidates: Sequence[Candidate]) -> 
     near: dict[str, float] = {}
     for other in candidates:
         imitated = float(similar[mine, hypotheses.index(other.hypothesis)]) ** 2
-        ratio = other.gain / best.gain
+        ratio = other.gain / max(best.gain, 1e-9)
         own = (ratio - imitated) / max(1 - imitated, 1e-9)
         if best.gain - other.gain < -2 * np.log(thresholds.alpha) or own > thresholds.form:
             near[other.hypothesis.effect] = ratio

@@ -1,108 +1,156 @@
-"""From the residual to effects: scan, refit the best, accept, scan again; and what speaks for the result."""
+"""From the residual to effects: scan, refit the best, scan again, refit pairs; and the verdict on what was tried."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid.missing.evidence import Solver, at_fit
 from sysid.missing.joint_fit import Start, moved_last
-from sysid.verdict.found import EFFORT, LARGEST, PairScan, Search, missing
+from sysid.verdict.agreement import interval_of_sum
+from sysid.verdict.forms import forms_of
+from sysid.verdict.found import EFFORT, LARGEST, Candidate, PairScan, Search
 from sysid.verdict.pairs import scan_pairs
-from sysid.verdict.rounds import NOTHING, POLISH, Asked, candidates_of, class_of, pair_round
+from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
+from sysid.verdict.rounds import POLISH, Asked, candidates_of, class_of, p_of_last, pair_round
+from sysid.verdict.scan import best
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A set of effects that were refitted together, and what it was found among."""
+
+    numbers: TriedSet
+    members: tuple[Candidate, ...]
+    """The refit of all is the last one's."""
+    rivals: tuple[Sequence[Candidate], ...]
+    """What was refitted in the place of each."""
+    together: float | None = None
+    """p-value of "nothing is missing" where it was found as a pair."""
 
 
 def pairs_of(asked: Asked, seed: int = 0) -> PairScan:
     """A scan of all pairs of effects beside the base."""
     pairs = scan_pairs(asked.evidence, asked.hypotheses, asked.refitter.reference.spread, asked.wander, asked.similar,
-                       asked.thresholds.alike, seed=seed)
+                       asked.thresholds.same, seed=seed)
     asked.report("scan of pairs")
     return pairs
 
 
 def settle(asked: Asked, pairs: PairScan | None) -> Search:
     """The verdict on one set of drives whose noise other drives show, from a scan of effects and of pairs."""
-    thresholds, base = asked.thresholds, asked.base
-    found = Search("none", base, base, asked.scan, excess=(asked.excess(base.residual),) * 2, pairs=pairs,
-                   steps=asked.steps, reason=NOTHING)
-    looks = [asked.scan.p_family, asked.p_left(base.residual)] + ([] if pairs is None else [pairs.p_family])
-    if min(looks) >= thresholds.alpha:
-        return found
-    _one_by_one(asked, found)
-    _drop_stand_ins(asked, found)
-    alone = len(found.accepted) == 1
-    calm = alone and asked.calm(found.accepted[-1].refit)
-    share = _share(asked, found)
-    if pairs is not None and not (calm and share >= thresholds.share):
-        # A single effect had its chance with every other one as a further effect.
-        pair_round(asked, found, {found.accepted[0].hypothesis.effect} if alone and not calm else set())
-        asked.report("refits of pairs")
-        share = _share(asked, found)
-    _decide(asked, found, share)
-    return found
+    base, wander = asked.base, asked.wander
+    excess = asked.excess(base.residual)
+    found = Search("none", base, base, asked.scan, excess=(excess, excess), pairs=pairs, reason=NOTHING)
+    findings = Findings(excess, asked.scan.p_family, None if pairs is None else pairs.p_family, asked.scan.p_family,
+                        asked.count, len(base.residual), wander.excess, wander.freedom, wander.usual)
+    weighed: list[Weighed] = []
+    if findings.something(asked.thresholds):
+        weighed = _one_by_one(asked, found, findings)
+        findings = _with(findings, found, weighed)
+        if pairs is not None and not findings.settled(asked.thresholds):
+            # A single effect had its chance with every other one as a further effect.
+            first = {weighed[0].numbers.effects[0]} if len(found.rounds) > 1 else set()
+            weighed += [_weighed(asked, members, [[one] for one in members], together)
+                        for members, together in pair_round(asked, pairs, first)]
+    return decided(asked, found, _with(findings, found, weighed), weighed)
 
 
-def _one_by_one(asked: Asked, found: Search) -> None:
-    """Accept effects one after the other, as long as more is left than other forms of them explain."""
-    current = asked.base
+def _with(findings: Findings, found: Search, weighed: Sequence[Weighed]) -> Findings:
+    return replace(findings, p_refit=found.p_value, sets=tuple(one.numbers for one in weighed))
+
+
+def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed]:
+    """Effects one after the other, as long as more is left than days differ by, or any stands out beside them."""
+    current, members, rivals = asked.base, tuple[Candidate, ...](), tuple[Sequence[Candidate], ...]()
+    out: list[Weighed] = []
     for _ in range(EFFORT.rounds):
         candidates = candidates_of(asked, found, current)
-        likely = (one for one in candidates if one.p < asked.thresholds.alpha)
-        taken_on = next((one for one in likely if not found.accepted or asked.own(one.refit)), None)
-        if taken_on is None:
-            return
-        found.accepted.append(taken_on)
-        found.classes.append(class_of(asked, taken_on, candidates))
-        current = taken_on.refit
-        if asked.calm(current):
-            return
+        apart = {one.hypothesis.effect: one for one in reversed(candidates) if one.p < asked.thresholds.alpha}
+        likely = sorted(apart.values(), key=lambda one: -one.gain)  # of several forms of an effect the best one
+        new = [_weighed(asked, (*members, one), (*rivals, candidates)) for one in likely[: EFFORT.weighed]]
+        out += new
+        able = [one for one in new if findings.own(one.numbers, asked.thresholds)]
+        if len(members) == 2:
+            out += [each for one in new[:1] for each in _without_stand_ins(asked, one)]
+        if not able or (asked.p_left(able[0].members[-1].refit.residual) >= asked.thresholds.alpha
+                        and not more_stands_out(asked, able[0])):
+            break
+        members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
+    return out
 
 
-def _drop_stand_ins(asked: Asked, found: Search) -> None:
-    """Drop what was accepted early because it resembles others together, and is worth nothing beside them.
-
-    Of three effects one may have been the first guess at the other two; the last one was accepted beside the others.
-    """
-    if len(found.accepted) < 3:
-        return
-    final = found.accepted[-1].refit
-    for number, one in enumerate(found.accepted[:-1]):
-        place = final.hypotheses.index(one.hypothesis)
-        if not asked.own(moved_last(final, place)):
-            q = np.concatenate([part for i, part in enumerate(final.split) if i != place])
-            kept = (*final.hypotheses[:place], *final.hypotheses[place + 1 :])
-            [without] = asked.refitter.fit_all([Start(kept, final.u, q)], POLISH)
-            del found.accepted[number], found.classes[number]
-            found.accepted[-1] = replace(found.accepted[-1], refit=without, share=asked.explained(without))
-            found.rounds.append([found.accepted[-1]])
-            return
+def more_stands_out(asked: Asked, one: Weighed) -> bool:
+    """Whether any further effect stands out beside a set of effects whose forms may be others, by a linear scan. What
+    these forms leave counts as noise."""
+    fit, forms = one.members[-1].refit, forms_of(asked.refitter, one.members[-1].refit, asked.evidence.groups)
+    bent = np.concatenate(forms.bent, axis=1).reshape(*fit.residual.shape, -1)
+    held = np.repeat([0.0, asked.thresholds.form**-2], [len(fit.q), bent.shape[-1]])
+    around = at_fit(asked.evidence, fit.residual, np.concatenate([fit.jacobian, bent], axis=-1),
+                    fit.u - asked.refitter.reference.u, held)
+    _, worth, _ = best(Solver(around), asked.hypotheses, asked.wander)
+    noise = 1 + max(one.numbers.bent.excess, 0.0)
+    return any(asked.scan.p_of(h, float(worth[h]) / noise) < asked.thresholds.alpha
+               for h, each in enumerate(asked.hypotheses) if each.effect not in one.numbers.effects)
 
 
-def _share(asked: Asked, found: Search) -> float:
-    return asked.named(found.accepted[-1].refit) if found.accepted else 0.0
+def _without_stand_ins(asked: Asked, one: Weighed) -> list[Weighed]:
+    """Two of three effects where the third was accepted early because it resembles both together."""
+    final, out = one.members[-1].refit, []
+    for number in range(len(one.members) - 1):
+        place = final.hypotheses.index(one.members[number].hypothesis)
+        q = np.concatenate([part for i, part in enumerate(final.split) if i != place])
+        kept = (*final.hypotheses[:place], *final.hypotheses[place + 1 :])
+        [without] = asked.refitter.fit_all([Start(kept, final.u, q)], POLISH)
+        members = tuple(each for i, each in enumerate(one.members) if i != number)
+        members = (*members[:-1], replace(members[-1], refit=without, share=asked.explained(without)))
+        rivals = tuple(each for i, each in enumerate(one.rivals) if i != number)
+        out.append(_weighed(asked, members, (*rivals[:-1], [members[-1]])))
+    return out
 
 
-def _decide(asked: Asked, found: Search, share: float) -> None:
-    """The verdict on what was accepted, which explains such a share."""
-    thresholds, named = asked.thresholds, {one.hypothesis.effect for one in found.accepted}
-    classes = [[name for name in members if name == members[0] or name not in named] for members in found.classes]
+def _weighed(asked: Asked, members: Sequence[Candidate], rivals: Sequence[Sequence[Candidate]],
+             together: float | None = None) -> Weighed:
+    """The numbers of a set of effects."""
+    fit = members[-1].refit
+    forms = forms_of(asked.refitter, fit, asked.evidence.groups)
+    form, count = asked.thresholds.form, range(len(members))
+    bent = _left(asked, forms.left(form))
+    own = [forms.gain(form, i, asked.evidence.groups) for i in count]
+    noise = 1 + max(bent.excess, 0.0)
+    p = [p_of_last(asked, moved_last(fit, i), gain / noise) for i, (gain, _) in enumerate(own)]
+    numbers = TriedSet(
+        tuple(one.effect for one in fit.hypotheses), tuple(one.key for one in fit.hypotheses), tuple(fit.q.tolist()),
+        asked.base.cost - fit.cost, tuple(p) if len(p) > 1 else (members[0].p,),
+        together if together is not None else max(asked.scan.p_family, min(one.p for one in rivals[0])),
+        _left(asked, fit.residual), tuple(gain for gain, _ in own), tuple(interval_of_sum(each)[0] for _, each in own),
+        bent,
+        tuple(tuple(class_of(asked, one, each)) for one, each in zip(members, rivals, strict=True)))
+    return Weighed(numbers, tuple(members), tuple(rivals), together)
+
+
+def _left(asked: Asked, residual: np.ndarray) -> Left:
+    excess = asked.excess(residual)
+    return Left(excess, excess - asked.wander.unshared(residual, asked.refitter.drives.repeats),
+                asked.anything(residual))
+
+
+def decided(asked: Asked, found: Search, findings: Findings, weighed: Sequence[Weighed]) -> Search:
+    """The search with the verdict on what was tried."""
+    found.judged(findings, asked.thresholds)
+    number = posterior(findings, asked.thresholds).chosen
+    if number is None:
+        return found
+    chosen = weighed[number]
+    found.accepted, found.together = list(chosen.members), chosen.together
+    found.final = chosen.members[-1].refit
+    found.excess = found.excess[0], chosen.numbers.left.excess
+    for one in chosen.members:
+        if not any(each is one for listed in found.rounds for each in listed):
+            found.rounds.append([one])
+    classes = chosen.numbers.apart()
     found.classes = [members[:LARGEST] for members in classes]
     found.crowd = [name for members in classes for name in members[LARGEST:]]
-    p_excess = asked.p_left(asked.base.residual)
-    if found.accepted:
-        found.final, found.share = found.accepted[-1].refit, share
-    before, after = asked.excess(asked.base.residual), asked.excess(found.final.residual)
-    found.excess = (before, after)
-    if not named and p_excess >= thresholds.alpha:
-        found.reason = "what stands out in a linear scan does not hold in a refit"
-    elif named and share >= thresholds.share:
-        found.verdict = "named"
-        found.reason = f"explains {share:.0%} of what can be explained"
-    elif not missing(found.p_value, p_excess, thresholds):
-        found.accepted, found.classes, found.crowd = [], [], []
-        found.final, found.share, found.excess = found.base, 0.0, (before, before)
-        found.reason = "what stands out has no name, and days with nothing missing differ by as much"
-    else:
-        found.verdict = "unexplained"
-        found.reason = (f"the best of the catalogue explains {share:.0%} of what can be explained, and {after:.0%} "
-                        "above the noise is left")
+    return found

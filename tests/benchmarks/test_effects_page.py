@@ -1,14 +1,22 @@
 """The page of the effects is that of the present classes and cards."""
 
 import pytest
+from PIL import Image
 
-from benchmarks.effects import DOCS, page
+from benchmarks.effects import BASE, COLOURS, DOCS, own_effects, page, place_of
 
 pytestmark = pytest.mark.quick
 
 
 def test_the_page_of_the_effects_is_up_to_date():
     assert (DOCS / "effects.md").read_text() == page(), "write it again: python -m benchmarks.effects page"
+
+
+def test_the_picture_of_the_effects_shows_each_of_them():
+    shown = Image.open(DOCS / "images" / "effects.png").text["Description"].split()
+    moving = {kind.name for kind in own_effects() if place_of(kind) in COLOURS}  # no drive differs by the others
+    assert shown == sorted(moving - set(BASE)), (
+        "draw it again: python -m benchmarks.effects figure")
 
 
 def test_the_page_shows_what_the_loop_looks_for():

@@ -19,7 +19,19 @@ from benchmarks.measured_loop import (
     of_terrain,
     run_log,
 )
-from benchmarks.measured_peers import Steps, all_values, fit_kinematic, motion
+from benchmarks.measured_peers import (
+    Steps,
+    all_values,
+    fit_kinematic,
+    fit_published,
+    fit_slip,
+    follow,
+    integrated,
+    motion,
+    sides,
+    steps_of,
+)
+from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.replay.models import with_effects
 from whill_mjx.vehicle.presets import preset_params
 
@@ -112,7 +124,7 @@ def test_each_third_of_a_run_is_held_back_once_and_lost_poses_leave_the_gyro():
 def test_a_peer_of_a_few_numbers_predicts_steps_that_it_was_not_fitted_to():
     truth = {"linear": 0.9, "angular": 0.6, "lag": 0.5, "delay": 0.15, "limit": 3.0}
 
-    def steps(seed, count=16, length=60):
+    def steps(seed, count=10, length=50):
         rng = np.random.default_rng(seed)
         command = np.repeat(rng.uniform([-4.0, -2.0], [4.0, 2.0], (count, 1, 2)), length, axis=1)
         start = rng.uniform([-2.0, -1.0], [2.0, 1.0], (count, 2))
@@ -129,3 +141,28 @@ def test_a_peer_of_a_few_numbers_predicts_steps_that_it_was_not_fitted_to():
         assert found[name] == pytest.approx(value, abs=0.15)  # lag and delay make up for one another
     moved = np.abs(paths[..., :2]).mean()
     assert np.abs(predict(other) - paths)[..., :2].mean() < 0.05 * moved
+
+
+def test_the_publishers_model_finds_its_own_powertrain_and_slip_again():
+    half, lag, delay, bounds = 0.54, 0.4, 0.1, (-3.0, 3.0)
+    slips = [np.array([0.1]), np.array([0.2]), np.array([0.02, -0.05, 0.3])]
+
+    def drives(seed, count=12, length=120):
+        rng = np.random.default_rng(seed)
+        command = np.repeat(rng.uniform([-4.0, -2.0], [4.0, 2.0], (count, 1, 2)), length, axis=1)
+        start = rng.uniform([-1.0, -0.5], [1.0, 0.5], (count, 2))
+        asked, first = sides(command, half), sides(start, half)
+        left, right = (follow(asked[..., side], first[:, side], lag, delay, bounds) for side in range(2))
+        v, omega = (left + right) / 2, (right - left) / (2 * half)
+        paths = integrated(v - 0.1 * v, -0.2 * v * omega, 0.7 * omega - 0.02 * v * omega + 0.05 * v)
+        t = np.arange(length) * 0.05
+        return tuple(Trial(f"run/{k}", "run", Command(t, *command[k].T),
+                           OdometryStream(t, None, None, None, v[k], omega[k]), PoseStream(t, *paths[k].T),
+                           Start(v=start[k, 0], omega=start[k, 1], measured=True)) for k in range(count)), paths
+
+    trials, _ = drives(0)
+    for found, true in zip(fit_slip(trials), slips, strict=True):
+        np.testing.assert_allclose(found, true, atol=0.03)
+    others, paths = drives(1)
+    predict = fit_published(trials, steps_of(trials, 2 * half))
+    assert np.abs(predict(steps_of(others, 2 * half))[:, :120] - paths).mean() < 0.05 * np.abs(paths).mean()

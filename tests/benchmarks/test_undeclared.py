@@ -16,6 +16,7 @@ from benchmarks.harness import record  # noqa: E402
 from benchmarks.plant.chair import VEHICLES  # noqa: E402
 from benchmarks.undeclared import Benchmark  # noqa: E402
 from benchmarks.undeclared_reference import Driven  # noqa: E402
+from sysid.verdict.posterior import Findings, Left, TriedSet, as_json  # noqa: E402
 
 LIMIT = 4.0
 NOTHING = {"stage": "null", "scale": 0.0, "verdict": "none", "share": 0.0, "p_value": 0.4, "effects": [],
@@ -300,3 +301,16 @@ def test_how_long_a_loop_takes_is_told_of_the_device_that_it_ran_on(tmp_path, de
     written = json.loads(record("fixture", "how it is written", found, tmp_path).read_text())["figures"]
     assert written[name]["versions"] == {"jax": "9.9.9"}
     assert "numpy" in written[name.replace("_", "_quick_")]["versions"]
+
+
+@pytest.mark.quick
+def test_evidence_that_was_kept_is_judged_again(tmp_path):
+    left = Left(0.0, 0.0, 0.0)
+    one = TriedSet(("slope",), ("slope",), (1.0,), 900.0, (1e-9,), 1e-9, left, (900.0,), (900.0,), left, (("slope",),))
+    kept = as_json(Findings(1.0, 1e-9, 1.0, 1e-9, 900.0, 9, 0.05, 8.0, 0.0, (one,)))
+    verdict = {"verdict": "unexplained", "share": 0.1, "effects": [], "excess": [1.0, 1.0], "findings": kept}
+    judged(tmp_path, "slope_x4_0", verdict, {"slope": 0.1})
+    contact.replay(tmp_path)
+    after = json.loads((tmp_path / "verdicts/slope_x4_0.json").read_text())
+    assert after["verdict"] == "named" and after["excess"] == [1.0, 0.0]
+    assert [effect["class"] for effect in after["effects"]] == [["slope"]]

@@ -5,7 +5,8 @@ import argparse
 import numpy as np
 import pytest
 
-from bridge.simulate import ChairSimulator, field
+from benchmarks.plant.first_day import write_urdf
+from bridge.simulate import ChairSimulator, field, make_vehicle, parse_arguments
 from bridge.simulated import halfway
 
 
@@ -96,3 +97,18 @@ def test_the_map_shows_as_occupied_what_the_scanner_meets_and_the_start_as_free(
     hits = [occupied(frame.x + (r + 0.03) * np.cos(a), frame.y + (r + 0.03) * np.sin(a)) for r, a in met]
     before = [occupied(frame.x + (r - 0.15) * np.cos(a), frame.y + (r - 0.15) * np.sin(a)) for r, a in met]
     assert np.mean(hits) > 0.95 and np.mean(before) < 0.2
+
+
+@pytest.mark.long
+def test_people_walk_past_a_robot_of_ones_own_and_its_scanner_meets_them_but_the_map_does_not(tmp_path):
+    robot = write_urdf(tmp_path / "small.urdf")
+    words = ["--task", "point_goal", "--set", "people=8", "--robot", str(robot)]
+    simulator = make_vehicle(parse_arguments(words))
+    frames = [simulator.reset(1)]
+    before = simulator.grid.occupied
+    frames += [simulator.step(0.0, 0.0) for _ in range(30)]
+    scans = np.stack([frame.ranges for frame in frames])
+    assert np.any(np.ptp(scans, axis=0) > 0.3)  # somebody walked through a ray of a vehicle that stands
+    assert np.array_equal(simulator.grid.occupied, before)
+    moved = [simulator.step(0.2, 0.0) for _ in range(10)][-1]
+    assert moved.v == pytest.approx(0.2, abs=0.02) or moved.done

@@ -19,6 +19,7 @@ from bridge.image import ImageError, compressed_to_rgb8
 from bridge.mcap_file import HEAD, MAGIC, _end, mend
 from bridge.parameters import as_options
 from bridge.record import recover
+from bridge.view import read_calibration
 
 pytestmark = pytest.mark.quick
 
@@ -55,6 +56,18 @@ def test_a_damaged_file_of_ros_parameters(tmp_path):
 
     check(path, b"/**:\n  ros__parameters:\n    policy: run/policy\n    v_max: 0.5\n    crop: [0, 0, 64, 64]\n"
           b"bridge_drive:\n  ros__parameters: {stale: 0.3, blind: stop, use_sim_time: true}\n", read, 100)
+
+
+def test_a_damaged_calibration_of_a_camera(tmp_path):
+    path = tmp_path / "camera.yaml"
+
+    def read():
+        lens = read_calibration(path)
+        assert min(lens.width, lens.height, *lens.matrix[:2]) > 0 and np.isfinite(lens.coefficients).all()
+
+    check(path, b"image_width: 640\nimage_height: 480\ncamera_matrix: {data: [400, 0, 321, 0, 410, 238, 0, 0, 1]}\n"
+          b"distortion_model: plumb_bob\ndistortion_coefficients: {data: [-0.3, 0.1, 0.001, -0.002, 0.01]}\n",
+          read, 50)
 
 
 def test_parameters_that_name_each_other_a_billion_times_are_refused_before_they_are_written_out(tmp_path):

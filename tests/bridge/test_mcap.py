@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.bridge_robot import message_type
 from bridge.mcap_file import McapWriter, definition_of, mend, stamp_of
-from bridge.record import MCAP
+from bridge.trial_writer import MCAP
 
 pytest.importorskip("rclpy")
 

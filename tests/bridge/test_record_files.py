@@ -8,8 +8,10 @@ import tomllib
 
 import pytest
 
-from bridge.record import TrialWriter, believed, finish, main, parse_arguments, toml_text, write_dataset_file
+from bridge.record import believed, finish, main, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
+from bridge.split_writer import SplitWriter
+from bridge.trial_writer import TrialWriter
 
 pytestmark = pytest.mark.quick
 
@@ -66,6 +68,38 @@ def test_recording_that_begins_with_a_manoeuvre_has_its_times_and_nothing_of_bef
     [odometry] = read(folder / "odometry.csv")
     assert (odometry["t"], odometry["x"], odometry["yaw"]) == (0.05, 0.0, 0.0)
     assert [row["t"] for row in read(folder / "ground_truth.csv")] == [0.05]
+
+
+def test_a_long_recording_is_split_where_the_vehicle_stands(tmp_path):
+    """Drives of 4 s and of 2 s, with 10 s of standstill before, between and after them."""
+    now, found = [0.0], []
+    (tmp_path / "trials" / "walk_1").mkdir(parents=True)  # of another day
+    writer = SplitWriter(tmp_path, "walk", 3.0, lambda folder, rows: found.append((folder.name, dict(rows))),
+                         lambda: now[0])
+    for i in range(360):
+        now[0] = 0.1 * i
+        v = 0.4 if 10 <= now[0] < 14 or 24 <= now[0] < 26 else 0.0
+        writer.command(now[0], v, 0.0)
+        writer.odometry(now[0], 0.1 * i, 0.0, 0.0, v + 0.002, 0.0)
+    assert writer.close() is None and [name for name, _ in found] == ["walk_2", "walk_3"]
+    for (name, rows), driven in zip(found, (4.0, 2.0), strict=True):
+        commands = read(tmp_path / "trials" / name / "command.csv")
+        moving = [row["t"] for row in commands if row["v"]]
+        assert moving[0] == pytest.approx(3.0, abs=0.15) and moving[-1] - moving[0] == pytest.approx(driven, abs=0.15)
+        assert commands[-1]["t"] - moving[-1] == pytest.approx(3.0, abs=0.15) and commands[0]["t"] == 0
+        assert rows["odometry"] == pytest.approx(10 * (driven + 6), abs=4)
+    assert writer.rows["odometry"] == sum(rows["odometry"] for _, rows in found)
+
+
+def test_a_split_recording_without_motion_writes_no_trial_and_one_that_goes_silent_ends_its_drive(tmp_path, capsys):
+    now = [0.0]
+    writer = SplitWriter(tmp_path, "walk", 3.0, lambda folder, rows: None, lambda: now[0])
+    writer.odometry(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert finish(writer) and "never moved" in capsys.readouterr().err and not (tmp_path / "trials").exists()
+    writer.odometry(1.0, 0.0, 0.0, 0.0, 0.3, 0.0)
+    now[0] = 9.0
+    writer.flush()
+    assert [folder.name for folder in writer.trials] == ["walk_1"]
 
 
 def test_values_that_are_not_finite_are_left_out(tmp_path):
@@ -126,7 +160,7 @@ def test_full_disk_ends_the_recording_with_its_cause_and_keeps_what_was_written(
     writer.command(0.1, 0.3, 0.0)
     with pytest.raises(OSError, match="No space"):
         writer.flush()
-    assert finish(writer) is None
+    assert not finish(writer)
     said = capsys.readouterr().err
     assert "No space left on device" in said and "Make room" in said
     (partial,) = tmp_path.glob(".full.partial-*")

@@ -30,6 +30,7 @@ from sysid.verdict.found import NullRefits
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.pipeline import find_missing
+from sysid.verdict.posterior import Findings, posterior, read
 from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import Asked
@@ -194,13 +195,12 @@ def test_simulated_days_come_out_alike_replayed_together_or_one_by_one(sloping, 
 
 @pytest.mark.parametrize("accepted", [True, False])
 def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(sloping, monkeypatch, accepted):
-    def rounds(_, found, *__):
-        if accepted:
-            found.accepted, found.together = [sloping.search.accepted[0]], 1e-4
+    def rounds(*_):
+        return [([sloping.search.accepted[0]], 1e-4)] if accepted else []
 
     monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
     monkeypatch.setattr("sysid.verdict.search.pair_round", rounds)
-    monkeypatch.setattr(Asked, "named", lambda *_: 1.0)
+    monkeypatch.setattr(Findings, "named", lambda *_: 1.0)
     nulls = run_null_refits(asked_of(sloping), settle, sloping.search.pairs, 2)
     assert nulls.alarms == (2 if accepted else 0)
     assert (nulls.p == 1e-4).all() == accepted
@@ -364,6 +364,9 @@ def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, caps
     assert config.seed == 0
     assert json.loads((tmp_path / "run/report.json").read_text())["verdict"] == report["verdict"] == "named"
     assert "verdict: named" in capsys.readouterr().out
+    again = posterior(read(tmp_path / "run/evidence.json"), CONFIG.thresholds)
+    assert (again.verdict, again.reason, again.weights) == ("named", report["reason"], report["weights"])
+    assert "something unknown" in (tmp_path / "run/report.html").read_text()
     main(Arguments(dataset=folder / "sloping", reference=(folder / "plain",), vehicle=tmp_path / "run/vehicle.toml",
                    out=tmp_path / "again"))
     *_, vehicle, _, start = asked[-1]

@@ -338,7 +338,8 @@ def test_a_converted_dataset_is_itself_convertible(bag, tmp_path):
 
 
 def test_a_bag_joins_a_dataset_that_the_recorder_began(bag, tmp_path):
-    from bridge.record import TrialWriter, parse_arguments, write_dataset_file
+    from bridge.record import parse_arguments, write_dataset_file
+    from bridge.trial_writer import TrialWriter
 
     folder = tmp_path / "log"
     writer = TrialWriter(folder, "straight_1")
@@ -434,6 +435,9 @@ def given(bag, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "report.json").write_text("{}")
     (tmp_path / "run" / "series.npz").write_bytes(b"")
+    (tmp_path / "world.sdf").write_text("<sdf/>")
+    (tmp_path / "strangers").mkdir()
+    (tmp_path / "strangers" / "odometry.csv").write_text("time,x,y\n0,0,0\n")
     convert(ConvertConfig(bag, tmp_path / "log"))
     return tmp_path
 
@@ -449,6 +453,8 @@ def given(bag, tmp_path):
     ("log/trials/figure_1", "one trial, not a dataset. Give the folder that holds dataset.toml"),
     ("log/dataset.toml", "a file of a dataset. Give its folder"),
     ("log/trials/figure_1/command.csv", "one file of a trial. Give the folder of the dataset"),
+    ("strangers", r"a folder of text files \(odometry.csv\), not a dataset. Convert it first"),
+    ("world.sdf", "a model of Gazebo .SDF.. Give the URDF"),
     ("nowhere", "no such folder or file"),
 ])
 def test_a_command_given_something_else_than_a_dataset_says_what_it_is_and_what_to_do(given, name, said):

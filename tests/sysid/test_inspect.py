@@ -157,8 +157,12 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     assert sanity(log_of(good)) == []
     flipped = replace(good, odometry=replace(good.odometry, omega=-good.odometry.omega))
     assert any("odometry: omega" in one and "sign is reversed" in one for one in sanity(log_of(flipped)))
+    backwards = replace(good, ground_truth=replace(good.ground_truth, yaw=good.ground_truth.yaw + np.pi))
+    assert any("moves against its own yaw" in one for one in sanity(log_of(backwards)))
     degrees = replace(good, odometry=replace(good.odometry, omega=np.rad2deg(good.odometry.omega)))
     assert any("check its unit (rad/s)" in one for one in sanity(log_of(degrees)))
+    swapped = replace(good, command=Command(good.command.t, good.command.omega, good.command.v))
+    assert any("the two columns are exchanged" in one for one in sanity(log_of(swapped)))
     millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
                                                      y=1e3 * good.ground_truth.y))
     assert any("must be in metres" in one for one in sanity(log_of(millimetres)))
@@ -168,6 +172,12 @@ def lively(seconds=20.0):
     """Speeds that turn through many headings."""
     t = np.arange(0.0, seconds, 0.01)
     return Command(t, 0.4 * np.sin(1.1 * t) + 0.2 * (t > 1), 0.8 * np.sin(0.5 * t + 0.4) * (t > 1))
+
+
+def lost(pose, **values):
+    """Other values for a second."""
+    gone = (pose.t > 9) & (pose.t < 10)
+    return replace(pose, **{name: np.where(gone, one, getattr(pose, name)) for name, one in values.items()})
 
 
 def turned(pose, degrees):
@@ -180,6 +190,10 @@ def turned(pose, degrees):
     (lambda pose: replace(pose, y=-pose.y), "the frame is left-handed"),
     (lambda pose: replace(pose, x=pose.y, y=pose.x), "the frame is left-handed"),
     (lambda pose: replace(pose, t=pose.t + 5.0), "its motion comes (4.9|5.0|5.1) s later .* another clock"),
+    (lambda pose: lost(pose, x=0.0, y=0.0, yaw=0.0), "its pose jumps by .* tracking was lost"),
+    (lambda pose: lost(pose, yaw=pose.yaw + np.pi), "its pose jumps by 3.* rad .* took another body"),
+    (lambda pose: replace(pose, yaw=0 * pose.yaw), "its yaw never changes, though .* turns"),
+    (lambda pose: replace(pose, y=0 * pose.y), "its y never changes, though .* another axis up"),
 ])
 def test_an_outside_pose_that_contradicts_the_odometry_is_named_and_no_sign_is_said_to_be_reversed(change, said):
     good = trial_of(lively())
@@ -194,8 +208,14 @@ def reset_at_9_s(o):
     return replace(o, x=o.x - o.x[k] * later, y=o.y - o.y[k] * later, yaw=o.yaw - o.yaw[k] * later)
 
 
+def held_up(o):
+    frozen = np.where((o.t > 8) & (o.t < 10), np.argmax(o.t > 8), np.arange(len(o.t)))
+    return replace(o, **{name: getattr(o, name)[frozen] for name in ("x", "y", "yaw", "v", "omega")})
+
+
 @pytest.mark.parametrize(("change", "said"), [
     (reset_at_9_s, "at 9.[01] s.* its pose jumps by .* it was reset there"),
+    (held_up, "its pose jumps by .* rows that repeat for (1.9|2.0) s: its driver was held up"),
     (lambda o: replace(o, v=o.v * np.cos(o.yaw)), "the twist is in the frame odom"),
     (lambda o: replace(o, v=0 * o.v), "its pose moves .*, but its speeds v are all zero"),
     (lambda o: replace(o, x=-o.y, y=o.x), "its pose moves 90 deg to the left of its own heading"),

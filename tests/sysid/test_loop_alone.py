@@ -18,9 +18,10 @@ from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import Commanded, make_batch, path_of
 from sysid.verdict import alone
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
-from sysid.verdict.found import Candidate, Effort, Thresholds
+from sysid.verdict.found import Candidate, Effort
+from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
-from sysid.verdict.rounds import NOTHING, Asked, begin
+from sysid.verdict.rounds import Asked, begin
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 
@@ -63,6 +64,7 @@ def test_bins_that_a_break_of_the_pose_touches_are_not_measured():
 def test_windows_without_replicates_are_put_into_eighths_and_replicates_are_not():
     windows = tuple(window(f"run/{i}", speed=1.0 + 0.1 * i) for i in range(16))
     assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=windows))] == [2] * 8
+    assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=windows[:5]))] == [1] * 5
     assert stands_alone(windows, known=False) and not stands_alone(windows, known=True)
     again = tuple(window(f"run/{i}") for i in range(16))
     assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=again))] == [16]

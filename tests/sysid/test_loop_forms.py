@@ -7,8 +7,8 @@ import pytest
 
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.joint_fit import Refit
-from sysid.verdict.forms import beside_forms, modulated
-from sysid.verdict.found import Thresholds
+from sysid.verdict.forms import forms_of, modulated
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.rounds import _rivals, _starts
 
 pytestmark = pytest.mark.quick
@@ -69,9 +69,11 @@ def test_what_other_forms_of_the_first_effect_explain_is_no_gain_of_a_second(sec
     model = Linear(second, (3.0, 0.0 if form else 1.0), form)
     fit = model.fit(2)
     assert abs(fit.q[1]) > 0.9  # it explains what the law of the first leaves
-    plain, found = model.fit(1).cost - fit.cost, beside_forms(model, fit, GROUPS, 0.5)
-    assert found.gain > 0.9 * plain if own else found.gain < 0.1 * plain
-    assert np.square(found.residual).mean() == pytest.approx(1.0, abs=0.05)
+    plain, found = model.fit(1).cost - fit.cost, forms_of(model, fit, GROUPS)
+    gain, apart = found.gain(0.5, 1, GROUPS)
+    assert gain > 0.9 * plain if own else gain < 0.1 * plain
+    assert (apart.min() > 0.2 * plain) == own
+    assert np.square(found.left(0.5)).mean() == pytest.approx(1.0, abs=0.05)
     assert own or np.square(model.fit(1).residual).mean() > 1.2  # by its law alone the first leaves more
 
 

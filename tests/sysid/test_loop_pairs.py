@@ -12,8 +12,8 @@ from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
-from sysid.verdict.found import Thresholds
 from sysid.verdict.pairs import scan_again, scan_pairs, tail
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.rounds import begin
 from sysid.verdict.scan import run
 from sysid.verdict.search import pairs_of as pairs_of_effects
@@ -65,7 +65,7 @@ def named(found):
 
 
 def test_a_hidden_pair_is_named_and_a_single_effect_stays_one(wander):
-    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.86), wander)
+    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.88), wander)
     assert named(pair) == ("named", {"slope", "track_width"})
     assert pair.scan.p_family > 0.01 > pair.p_value and pair.share > 0.7
     assert named(verdict(drives((0.0, 0.0, 1.0, 0.0)), wander)) == ("named", {"side_force"})

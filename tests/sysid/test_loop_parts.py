@@ -15,15 +15,15 @@ from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
-from sysid.pages.loop_page import not_determined
+from sysid.pages.loop_page import not_determined, weights
 from sysid.pages.loop_report import in_range, unit_of
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import foretold
 from sysid.verdict.classes import imitation
-from sysid.verdict.found import Candidate, Scan, Search, Thresholds
+from sysid.verdict.found import Scan
+from sysid.verdict.posterior import Findings, Left, Thresholds, TriedSet, posterior, read, write
 from sysid.verdict.rounds import Asked
-from sysid.verdict.search import _decide
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.presets import preset
 
@@ -103,8 +103,20 @@ def test_an_effect_is_held_against_what_it_leaves_though_it_could_be_predicted(s
     drives = SimpleNamespace(mask=np.ones(residual.shape), repeats=np.repeat([0, 1], trials // 2))
     asked = Asked(None, (one,), SimpleNamespace(drives=drives), Wander((), (), freedom=10.0), Thresholds(),
                   SimpleNamespace(cost=float(residual.size)), None, None, lambda _: smooth * residual.size)
-    fit = Refit((one,), np.zeros(0), np.ones(1), 0.0, residual, np.zeros((1, 1, 1)), np.zeros(0))
-    assert asked.named(fit) == pytest.approx(share, abs=0.03)
+    left = search_module._left(asked, residual)
+    findings = Findings(0.0, 0.0, None, 0.0, residual.size, trials, asked.wander.excess, 10.0, 0.0)
+    assert findings.share(residual.size, left, 0.25, Thresholds().alpha) == pytest.approx(share, abs=0.03)
+
+
+def tried(excess, p=1e-6, effects=("quadratic_drag",), gain=1.0, bent=0.0, own=None, smooth=0.0):
+    left, size = Left(excess, excess, smooth), len(effects)
+    return TriedSet(effects, effects, (1.0,) * size, gain, (p,) * size, p, left, own or (gain,) * size,
+                    own or (gain,) * size, Left(bent, bent, 0.0), tuple((name,) for name in effects))
+
+
+def findings(excess, sets, p=0.0):
+    """Of drives of which days with nothing missing differ by 1."""
+    return Findings(excess, 0.0, None, p, 1.0, 1, 1.0, 10.0, 0.0, tuple(sets))
 
 
 @pytest.mark.quick
@@ -121,24 +133,9 @@ def test_an_effect_is_held_against_what_it_leaves_though_it_could_be_predicted(s
 def test_what_has_no_name_is_missing_where_search_and_excess_say_so_or_one_of_them_beyond_doubt(
     search_p, excess, verdict
 ):
-    one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
-
-    def fit(cost):
-        return Refit((one,), np.zeros(0), np.ones(1), cost, np.full((1, 1), np.sqrt(cost)), np.zeros((1, 1, 1)),
-                     np.zeros(0))
-
-    candidate = Candidate(one, 1.0, search_p, 0.1, fit(1 + 0.9 * excess))
-    found = Search("none", fit(1 + excess), fit(1 + excess), SimpleNamespace(p_family=0.0), rounds=[[candidate]])
-    if search_p < Thresholds().alpha:
-        found.accepted, found.classes = [candidate], [["quadratic_drag"]]
-    wander = Wander((), (), freedom=10.0, excess=1.0)
-    refitter = SimpleNamespace(drives=SimpleNamespace(mask=np.ones(1)))
-    asked = Asked(None, (one,), refitter, wander, Thresholds(), found.base, None, None)
-    _decide(asked, found, 0.1)
+    found = posterior(findings(excess, [tried(0.9 * excess, search_p, gain=0.1, smooth=0.9)], search_p), Thresholds())
     assert found.verdict == verdict
-    if verdict == "none":
-        assert not found.accepted and not found.classes and found.final is found.base and found.share == 0
-        assert found.excess == (pytest.approx(excess), pytest.approx(excess))
+    assert (found.chosen is None) == (verdict == "none" or search_p > Thresholds().alpha)
 
 
 def base_fit(excess):
@@ -167,26 +164,44 @@ def test_a_simulated_day_is_an_alarm_where_the_verdict_would_be_that_something_i
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize(("left", "pairs"), [(0.0, False), (9.0, True)])
-def test_pairs_have_their_chance_by_what_is_left_once_stand_ins_are_dropped(left, pairs, monkeypatch):
-    """The last fit before a stand-in is dropped leaves nothing; the fit without it leaves `left`."""
-    one = Hypothesis("quadratic_drag", (Axis("quadratic_drag.coefficient", 1.0),))
+def test_a_further_effect_must_do_more_than_to_mend_the_form_of_the_others():
+    first, both = tried(8.0, gain=200.0, bent=8.0), ("quadratic_drag", "slope")
+    for own, names in (((200.0, 90.0), 2), ((200.0, -1.0), 1)):
+        given = findings(28.0, [first, tried(0.0, effects=both, gain=280.0, own=own, bent=5.0)])
+        found = posterior(given, Thresholds())
+        assert found.verdict == "named" and len(given.sets[found.chosen].effects) == names
+        assert sum(found.weights.values()) == pytest.approx(1.0)
 
-    def drop(_, found):
-        found.accepted[-1] = replace(found.accepted[-1], refit=base_fit(left))
 
-    asked = []
-    scan = SimpleNamespace(p_family=0.0, gain=None, worth=None, q=None)
-    monkeypatch.setattr(search_module, "class_of", lambda *_: None)
-    monkeypatch.setattr(rounds, "refitted", lambda *_: [Candidate(one, 1.0, 1e-6, 0.9, base_fit(0.0))])
-    monkeypatch.setattr(search_module, "_drop_stand_ins", drop)
-    monkeypatch.setattr(Asked, "beside_forms", lambda _, fit: SimpleNamespace(residual=fit.residual))
-    monkeypatch.setattr(search_module, "pair_round", lambda *_: asked.append(True))
-    monkeypatch.setattr(search_module, "_decide", lambda *_: None)
-    refitter = SimpleNamespace(drives=SimpleNamespace(mask=np.ones(1), repeats=np.zeros(1, int)))
-    wander = Wander((), (), freedom=10.0, excess=1.0)
-    search_module.settle(Asked(None, [one], refitter, wander, Thresholds(), base_fit(10.0), scan, None), scan)
-    assert bool(asked) == pairs
+@pytest.mark.quick
+def test_a_further_effect_must_gain_more_than_days_differ_by():
+    for gain, chosen in ((28.0, 0), (38.0, 1)):
+        given = findings(28.0, [tried(5.0, gain=23.0), tried(0.0, effects=("quadratic_drag", "slope"), gain=gain)])
+        assert posterior(given, Thresholds()).chosen == chosen
+
+
+@pytest.mark.quick
+def test_weights_are_bars_of_names_that_people_use():
+    drawn = weights({"weights": {"noise": 0.2, "quadratic_drag + slope": 0.5, "unknown": 0.3}})
+    assert all(text in drawn for text in ("only the noise", "quadratic drag and slope", "something unknown"))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("content", "wrong"), [("{}", "kind None"), ("[]", "a JSON object"), ("{", "not valid JSON")])
+def test_a_file_without_findings_is_refused_in_one_line(content, wrong, tmp_path):
+    (tmp_path / "evidence.json").write_text(content)
+    with pytest.raises(ValueError, match=wrong) as refused:
+        read(tmp_path / "evidence.json")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.quick
+def test_saved_findings_give_the_same_verdict(tmp_path):
+    given = replace(findings(9.0, [tried(0.0, gain=9.0)]), against={"quadratic_drag": ["it grows with the time"]})
+    write(tmp_path / "evidence.json", given)
+    assert read(tmp_path / "evidence.json") == given
+    found = posterior(read(tmp_path / "evidence.json"), Thresholds())
+    assert found.verdict == "unexplained" and found.reason.endswith("but it grows with the time")
 
 
 @pytest.mark.quick

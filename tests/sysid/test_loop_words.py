@@ -41,6 +41,25 @@ def test_the_title_says_what_was_found_with_its_size_and_interval():
     assert title(report(verdict="unexplained")).startswith("Something is missing")
 
 
+def test_drives_that_stand_alone_are_not_said_to_be_described_to_within_their_noise():
+    errors = {"training": {"ground_truth": {"trajectory": 2.7}}, "held_out": {"ground_truth": {}, "odometry": {}}}
+    alone = report(verdict="none", known=False) | dict.fromkeys(("before", "refitted", "after"), errors)
+    assert title(alone) == "No known effect stands out in these drives"
+    what, change, _ = lead(alone)
+    assert "no drive was repeated" in what
+    assert change.startswith("On the drives that were fitted") and "270.0 cm" in change
+
+
+def test_another_floor_is_in_the_title_and_what_drives_elsewhere_is_not_said_to_be_as_on_other_days():
+    floor = {"name": "another floor", "members": []}
+    assert title(report(verdict="none", floor=floor)) == "Changed: another floor"
+    assert "as on another floor" in lead(report(verdict="none", floor=floor))[0]
+    assert title(report(DELAY, floor=floor)).endswith("(0.113 to 0.190); Changed: another floor")
+    base = [{"name": "body.com_x", "reference": 0.0, "spread": 0.01, "before": 0.3, "away": 30.2},
+            {"name": "torque_drive.kp", "reference": 1.0, "spread": 1.0, "before": 1.2, "away": 0.2}]
+    assert "com x by 30 day-to-day spreads." in lead(report(verdict="none", base=base))[0]
+
+
 def test_an_effect_that_was_there_before_has_changed():
     had = effect("command_delay", {"command_delay.delay": parameter(0.152, 0.113, 0.190, was=0.02)})
     assert title(report(had)) == "Missing: command delay 0.152 s (0.113 to 0.190)"  # no more than it is unsure by

@@ -10,7 +10,15 @@ import pytest
 from conftest import shared_folder
 
 from sysid.close_loop import Arguments, load
-from sysid.logs.measured import detect_format, load_any, load_drive, load_mrclam, only_changes, split
+from sysid.logs.measured import (
+    CONTINUOUS_COLUMNS,
+    detect_format,
+    load_any,
+    load_drive,
+    load_mrclam,
+    only_changes,
+    split,
+)
 from whill_mjx.vehicle.specs import CREATE, WARTHOG
 
 pytestmark = pytest.mark.quick
@@ -173,6 +181,7 @@ def test_formats_are_told_apart_and_bad_calls_named(tmp_path):
         load_any(tmp_path)
     with pytest.raises(FileNotFoundError, match="no run 'warthog_moon'"):
         load_drive(tmp_path, ("warthog_moon",))
+    write_drive(tmp_path / "husky_steps_000_133.npz")
     with pytest.raises(ValueError, match="different robots"):
         load_drive(tmp_path, ("warthog_sand_1", "husky_steps_000_133"))
     np.savez(tmp_path / "warthog_sand_2.npz", data=np.zeros((3, 2)), columns=np.array(["a", "b"]))
@@ -198,6 +207,35 @@ def test_the_loop_takes_parts_of_a_measured_set_and_its_reference_another(tmp_pa
         load(Arguments(dataset=tmp_path))
 
 
+@pytest.mark.parametrize(("selection", "runs"), [
+    ("sand", ["warthog_sand_1", "warthog_sand_2"]), ("warthog_sand_2", ["warthog_sand_2"]),
+    ("warthog_gravel/001.0", ["warthog_gravel"])])
+def test_a_selection_is_a_run_a_group_of_runs_or_a_trial(tmp_path, selection, runs):
+    for run in ("warthog_sand_1", "warthog_sand_2", "warthog_gravel"):
+        write_arc(tmp_path / f"{run}.npz", 0.5)
+    log = load_any(tmp_path, train=(selection,))
+    assert sorted({trial.name.split("/")[0] for trial in log.training}) == runs
+
+
+def test_a_run_whose_name_has_no_robot_says_whose_sizes_are_taken(tmp_path):
+    write_arc(tmp_path / "course_7.npz", 0.5)
+    log = load_drive(tmp_path, ("course_7",))
+    assert log.spec == WARTHOG and "no robot" in log.notes[0]
+
+
+@pytest.mark.parametrize("selection", ["warthog_gravel:0.9-0.2", "warthog_gravel:2-3"])
+def test_a_share_in_which_no_trial_lies_is_refused(tmp_path, selection):
+    write_arc(tmp_path / "warthog_gravel.npz", 0.5)
+    with pytest.raises(ValueError, match="no trial of 6 lies there"):
+        load_any(tmp_path, train=(selection,))
+
+
+def test_a_robot_that_the_set_does_not_have_is_named(tmp_path):
+    (tmp_path / "Robot1_Odometry.dat").write_text("0 0 0\n")
+    with pytest.raises(ValueError, match="robot1 to robot5"):
+        load_any(tmp_path, train=("robotx",))
+
+
 def test_selections_split_a_run_by_share_and_must_be_disjoint(tmp_path):
     write_drive(tmp_path / "warthog_sand_1.npz", rows=9)
     log = load_drive(tmp_path, ("warthog_sand_1",))
@@ -220,6 +258,32 @@ def test_the_published_drive_runs_load_with_the_gyro_sign_of_the_icp():
         turned = np.array([trial.ground_truth.yaw[-1] / trial.ground_truth.t[-1] for trial in log.trials])
         gyro = np.array([log.fields["gyro"][trial.name] for trial in log.trials])
         assert (turned * gyro).sum() / (gyro**2).sum() == pytest.approx(0.95, abs=0.15)
+
+
+def write_continuous(path, sign=1.0, omega=0.5, v=0.4):
+    """30 s on an arc at 20 Hz, the ICP held for 4 samples, as one log with a gyro."""
+    names = [*CONTINUOUS_COLUMNS, "imu_z", "ros_time", "calib_state"]
+    rows = [dict.fromkeys(names, 0.0)]
+    for i in range(600):
+        yaw = omega * 0.05 * (i // 4 * 4)
+        left, right = (v + side * omega * WARTHOG.track / 2 for side in (-1, 1))
+        rows.append(dict.fromkeys(names, 0.0) | {
+            "icp_quat_z": np.sin(yaw / 2), "icp_quat_w": np.cos(yaw / 2), "icp_pos_x": v / omega * np.sin(yaw),
+            "icp_pos_y": v / omega * (1 - np.cos(yaw)), "meas_left_vel": left / WARTHOG.wheel_radius,
+            "meas_right_vel": right / WARTHOG.wheel_radius, "cmd_vel_x": v, "cmd_vel_omega": omega,
+            "imu_z": sign * omega, "ros_time": 10**18 + i * 50_000_000, "calib_state": "calib"})
+    lines = [",".join(names), *(",".join(str(row[name]) for name in names) for row in rows)]
+    path.write_bytes(gzip.compress("\n".join(lines).encode()))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_gyro_of_a_continuous_log_is_a_channel(tmp_path, sign):
+    write_continuous(tmp_path / "warthog_grass_continuous.csv.gz", sign)
+    log = load_drive(tmp_path, ("grass",), chained=True)
+    assert len(log.trials) == 4 and ("sign is changed" in log.notes[0]) == (sign < 0)
+    for trial in log.trials:
+        assert trial.gyro.turn[-1] == pytest.approx(0.5 * trial.gyro.t[-1])
+        np.testing.assert_allclose(log.fields["yaw_rate"][trial.name][1], 0.5)
 
 
 def test_the_published_continuous_run_loads():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sysid.logs.coverage import sanity
+from sysid.logs.coverage import doubts, sanity
 from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
@@ -40,9 +41,10 @@ def log_of(*trials):
 def test_a_long_drive_is_cut_into_windows_that_begin_where_it_was():
     whole = drive(seconds=130.0)
     log = in_windows(log_of(whole, drive("short", seed=1)))
-    assert len(log.trials) == 7 and log.trials[-1].name == "short" and "130 s" in log.notes[-1]
+    assert len(log.trials) == 8 and log.trials[-1].name == "short" and "130 s" in log.notes[-1]
+    assert sum(trial.duration for trial in log.trials[:-1]) > whole.duration - 1.0  # nothing of its end is lost
     for number, trial in enumerate(log.trials[:-1]):
-        begin = number * WINDOW
+        begin = number * whole.duration / 7
         assert trial.name == f"a/{number:03d}" and trial.duration <= WINDOW and trial.command.t[0] == 0.0
         first = np.searchsorted(whole.odometry.t, begin - 1e-9)
         np.testing.assert_allclose(trial.command.v[0], whole.command.v[first])
@@ -52,6 +54,26 @@ def test_a_long_drive_is_cut_into_windows_that_begin_where_it_was():
             far = np.hypot(trial.odometry.x, trial.odometry.y)[::5][: len(moved.t)]
             np.testing.assert_allclose(np.hypot(moved.x - start.x, moved.y - start.y), far, atol=0.1)
             assert trial.start.measured and abs(trial.gyro.turn[-1]) > 0
+
+
+@pytest.mark.parametrize(("way", "turn", "said"), [
+    (1.0, 1.09, "turns 0.9.* the track is then"), (1.09, 1.09, "goes 0.9.* the wheel radius is then"), (1.02, 0.98, ""),
+])  # fmt: skip
+def test_nominal_sizes_that_the_outside_pose_contradicts_are_named(way, turn, said):
+    trials = []
+    for trial in (drive("a"), drive("b", seed=1)):
+        o = trial.odometry
+        trials.append(replace(trial, odometry=OdometryStream(o.t, None, None, None, way * o.v, turn * o.omega)))
+    found = sanity(log_of(*trials))
+    assert len(found) == bool(said) and all(re.search(said, one) for one in found)
+    assert doubts(log_of(*trials)) == []  # a fit frees sizes itself
+
+
+def test_a_fit_and_a_loop_say_first_that_a_log_contradicts_itself():
+    trial = drive("a")
+    late = replace(trial, command=replace(trial.command, t=trial.command.t + 4.0))
+    said = doubts(log_of(late))[0]
+    assert re.match("Check the log: .* another clock", said)
 
 
 def test_the_start_of_a_window_is_a_line_through_noisy_poses():
@@ -126,3 +148,11 @@ def test_a_gyro_alone_is_refused_with_the_reason(tmp_path):
     folder = write(tmp_path, "", trial, ("imu", "t,gyro", np.column_stack([trial.gyro.t, trial.gyro.turn])))
     with pytest.raises(ValueError, match="imu.csv alone shows no speed"):
         load_log(folder)
+
+
+def test_windows_of_a_long_drive_can_be_held_out(tmp_path):
+    trial = drive("whole", seconds=130.0)
+    pose = "ground_truth", "t,x,y,yaw", np.column_stack([trial.ground_truth.t, trial.ground_truth.values])
+    log = load_any(write(tmp_path, "", trial, pose), train=("whole:0-0.6",), held_out=("whole:0.6-1",))
+    names = [one.name for one in (*log.training, *log.held_out)]
+    assert names == [f"whole/{k:03d}" for k in range(len(names))] and len(log.training) > len(log.held_out) > 1

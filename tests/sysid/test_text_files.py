@@ -107,7 +107,15 @@ def test_tables_of_other_programs_are_read_and_what_is_left_out_is_said(tmp_path
     assert any(re.search(says, note) for note in notes)
 
 
-@pytest.mark.parametrize("names", [with_units, without_units, plotted])
+def level(c):
+    """A quaternion as of a vehicle on a floor, and units before the last word."""
+    pose = {f"/odom/pose/pose/orientation/{name}": getattr(np, of)(c["yaw"] / 2) for name, of in (("z", "sin"),
+                                                                                                 ("w", "cos"))}
+    rest = {name: values for name, values in plotted(c).items() if "orientation" not in name and "cmd" not in name}
+    return {**rest, **pose, "speed_kmh_cmd": 3.6 * c["cv"], "yawrate_dps_cmd": np.rad2deg(c["cw"])}
+
+
+@pytest.mark.parametrize("names", [with_units, without_units, plotted, level])
 def test_columns_are_found_by_their_names_and_units_by_names_or_numbers(tmp_path, names):
     log, _ = convert(ConvertConfig(write(tmp_path / "drive.csv", names(columns())), tmp_path / "log"))
     (trial,) = log.trials
@@ -172,7 +180,8 @@ def test_a_clock_that_was_set_back_is_refused_and_rows_out_of_order_are_not(tmp_
     check(log.trials[0], pose=False)
 
 
-@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f+02:00", "%H:%M:%S.%f"])
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f+02:00", "%H:%M:%S.%f",
+                                  "%M:%S.%f"])
 def test_dates_and_times_of_day_are_times_also_past_midnight(tmp_path, form):
     c = columns()
     path = write(tmp_path / "drive.csv", clocked(c, c["t"]))

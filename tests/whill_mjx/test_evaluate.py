@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import os
+import re
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import pytest
 from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
 from whill_mjx.evaluate import EvaluateOptions, choose_task, main
+from whill_mjx.evaluation import pages
 from whill_mjx.evaluation.conditions import nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures, summarise
@@ -132,6 +134,36 @@ def test_network_operators_agree_with_onnxruntime_on_a_graph_of_many():
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     for ours, theirs in zip(jax.jit(Network(data))(x), session.run(None, {"x": x}), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+ONE_OPERATOR = (  # with its attributes, and the constants after the first input (3, 4)
+    ("Atan", {}, ()), ("Ceil", {}, ()), ("Round", {}, ()), ("Tan", {}, ()), ("Erf", {}, ()), ("Dropout", {}, ()),
+    ("Elu", {"alpha": 0.7}, ()), ("LeakyRelu", {"alpha": 0.2}, ()), ("LogSoftmax", {"axis": 0}, ()),
+    ("Flatten", {"axis": 0}, ()),
+    ("CastLike", {}, (np.zeros(1, np.float32),)), ("Tile", {}, (np.array([2, 1]),)),
+    ("Mod", {"fmod": 1}, (np.array([0.7], np.float32),)), ("ReduceProd", {"keepdims": 0}, (np.array([1]),)),
+    ("LayerNormalization", {"epsilon": 1e-3}, (np.arange(4, dtype=np.float32), np.ones(4, np.float32))),
+    ("BatchNormalization", {}, tuple(np.arange(1, 5, dtype=np.float32) * k for k in (1, 2, 3, 4))),
+)  # fmt: skip
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("kind", "attributes", "constants"), ONE_OPERATOR, ids=[one[0] for one in ONE_OPERATOR])
+def test_an_operator_of_other_libraries_agrees_with_onnxruntime(kind, attributes, constants):
+    import onnxruntime
+    from onnx import TensorProto, helper, numpy_helper
+
+    named = [numpy_helper.from_array(value, f"c{k}") for k, value in enumerate(constants)]
+    graph = helper.make_graph(
+        [helper.make_node(kind, ["x", *(one.name for one in named)], ["y"], **attributes)], kind,
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, [3, 4])],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)], named,
+    )  # fmt: skip
+    data = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8).SerializeToString()
+    x = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)
+    [theirs] = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"]).run(None, {"x": x})
+    np.testing.assert_allclose(Network(data)(x)[0], theirs, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(Network(data))(x)[0], theirs, atol=1e-5)
 
 
 @pytest.mark.quick
@@ -323,8 +355,19 @@ def test_a_video_that_cannot_be_written_says_what_ffmpeg_said(tmp_path):
 def test_the_page_of_an_evaluation_has_words_and_the_style_of_all_reports(evaluated):
     out, _ = evaluated
     text = (out / "report.html").read_text()
-    assert STYLE in text
-    for words in ("smallest clearance [m]", "time to the goal [s]", "the policy: it sees only its first image"):
+    assert STYLE in text and re.search(r'class="lead">[^<]* succeeds in [^<]*%[^<]* Without sight it succeeds in', text)
+    for words in ("smallest clearance [m]", "time to the goal [s]", "the policy with its first image alone"):
         assert words in text
     for key in ("min_clearance_m", "time_to_goal_s", "acceleration_rms_m_s2"):
         assert key not in text
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_the_legend_of_few_maps_is_not_wider_than_their_picture(columns):
+    plt = pages._pyplot()
+    figure, _ = plt.subplots(1, columns, figsize=(3.2 * columns, 2.2), layout="constrained")
+    pages._legend(figure, set(pages.ENDINGS), columns)
+    figure.canvas.draw()
+    place = figure.legends[0].get_window_extent()
+    plt.close(figure)
+    assert 0 <= place.x0 and place.x1 <= figure.bbox.width

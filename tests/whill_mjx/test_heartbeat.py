@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import re
+import select
 import sys
 import threading
 from pathlib import Path
@@ -50,6 +53,15 @@ def test_an_open_bar_is_refreshed_instead(monkeypatch):
     with tqdm(total=10, desc="training", file=lines, mininterval=0, ascii=True):
         with Heartbeat(every_s=0.05):
             assert lines.enough.wait(60), "the bar stood still"
+
+
+def test_a_bar_is_shown_in_a_terminal_that_states_no_size():
+    terminal, other_end = pty.openpty()  # of 0 rows and 0 columns, as in some containers
+    with open(other_end, "w") as file, tqdm(total=10, desc="training", file=file, dynamic_ncols=True):
+        with Heartbeat(every_s=0.05):
+            assert select.select([terminal], [], [], 60)[0], "the bar was not drawn"
+            assert b"training" in os.read(terminal, 100)
+    os.close(terminal)
 
 
 def test_the_heartbeat_ends_with_its_block():

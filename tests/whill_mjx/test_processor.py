@@ -12,7 +12,7 @@ import pytest
 
 from sysid import command_line as commands
 from whill_mjx.io import command_line
-from whill_mjx.processor import FLAG, OPTION, as_one_function, share_results, shares_results
+from whill_mjx.processor import FLAG, OPTION, WIDE, as_one_function, share_results, shares_results
 
 pytestmark = pytest.mark.quick
 
@@ -96,12 +96,26 @@ def printed(program, flags):
     return float(done.stdout.split()[-1])
 
 
+CORES = """
+import os
+from whill_mjx import device_per_core
+many = len(os.sched_getaffinity(0))
+every, some, one = device_per_core(6 * many), device_per_core(7 * many + 1), device_per_core(1)
+assert (7 * many + 1) % len(some) == 0 and len(one) == 1
+print("devices", len(every))
+"""
+
+
 def run(flags):
     return printed(PROGRAM, flags)
 
 
 def test_twenty_results_of_one_chain_do_not_compute_it_twenty_times():
     assert run("") < 2 * (60 + 20)
+
+
+def test_each_core_is_a_device_where_the_instances_can_be_split_evenly():
+    assert printed(CORES, "") == len(os.sched_getaffinity(0))
 
 
 def test_without_the_option_they_do():
@@ -149,14 +163,14 @@ def test_commands_of_the_simulator_share_results(monkeypatch):
 
 
 def test_options_that_were_given_are_kept(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_cpu_max_isa=AVX2 {WIDE}=128")
     share_results()
-    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_max_isa=AVX2 {FLAG}={OPTION}"
+    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_max_isa=AVX2 {WIDE}=128 {FLAG}={OPTION}"
     share_results()
     assert os.environ["XLA_FLAGS"].count(OPTION) == 1
-    monkeypatch.setenv("XLA_FLAGS", f"{FLAG}=xla_another_option")
+    monkeypatch.setenv("XLA_FLAGS", f"{FLAG}=xla_another_option {WIDE}=128")
     share_results()
-    assert os.environ["XLA_FLAGS"] == f"{FLAG}=xla_another_option"
+    assert os.environ["XLA_FLAGS"] == f"{FLAG}=xla_another_option {WIDE}=128"
 
 
 def swinging(x, pushes):

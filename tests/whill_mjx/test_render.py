@@ -109,10 +109,11 @@ def test_a_mirrored_scene_gives_the_mirrored_image():
 
 def test_a_batch_of_images_equals_images_one_by_one_but_for_pixels_on_edges():
     scenes = jax.vmap(random_scene)(jax.random.split(jax.random.key(3), 3))
-    batch = jax.jit(jax.vmap(render, in_axes=(None, None, None, 0)))(EYE, LEVEL, LENS, scenes)
+    eye = EYE + jnp.array([0.013, 0.007, 0.0])  # above a corner of tiles, rays would meet their edges exactly
+    batch = jax.jit(jax.vmap(render, in_axes=(None, None, None, 0)))(eye, LEVEL, LENS, scenes)
     single = jax.jit(render)
     for index in range(3):
-        image = single(EYE, LEVEL, LENS, jax.tree.map(lambda leaf, i=index: leaf[i], scenes))
+        image = single(eye, LEVEL, LENS, jax.tree.map(lambda leaf, i=index: leaf[i], scenes))
         assert (np.abs(np.asarray(batch[index]).astype(int) - np.asarray(image)) <= 1).mean() > 0.998
 
 

@@ -106,6 +106,12 @@ def test_a_training_a_fit_and_a_loop_stand_on_one_page(tmp_path):
     assert 'href="./fit/report.html"' in page and "data:image/png;base64," in page and "<video" in page
 
 
+def test_a_proposed_drive_is_known_by_its_page_alone(tmp_path):
+    (tmp_path / "command.html").write_text('<p class="lead">Drive chirp next.</p>')
+    run = read_run(tmp_path)
+    assert (run.kind, run.state, run.sentence) == ("next drive", "finished", "Drive chirp next.")
+
+
 def test_the_page_needs_nothing_but_itself(tmp_path):
     page = page_of(finished(tmp_path / "train"), fit(tmp_path / "fit"))
     parsed = Tags(page)

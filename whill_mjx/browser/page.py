@@ -153,11 +153,11 @@ def figures(runs: Sequence[Run], problems: dict[str, list[str]]) -> str:
     parts = []
     evaluated = [[run.name, *row] for run in runs for row in _each(run, problems, _drivers)]
     if evaluated:
-        parts.append(html.table(["run", "driver", "episodes", "success", "95 % interval", "collision", "time-out",
+        parts.append(html.table(["run", "driver", "episodes", "success", "95% interval", "collision", "time-out",
                                  "time to the goal [s]", "return"], evaluated, "evaluations"))
     named = [[run.name, *row] for run in runs for row in _each(run, problems, _effects)]
     if named:
-        parts.append(html.table(["run", "effect", "parameter", "value", "95 % from", "to", "unit"], named,
+        parts.append(html.table(["run", "effect", "parameter", "value", "95% from", "to", "unit"], named,
                                 "effects that were named"))
     fitted = {run.name: dict(_each(run, problems, _parameters)) for run in runs if run.kind == "fit"}
     fitted = {name: values for name, values in fitted.items() if values}

@@ -25,7 +25,7 @@ KINDS = {
 }  # fmt: skip
 """Words for what `run.json` or `report.json` says of its kind."""
 MADE_BY = (("metrics.jsonl", "training"), ("checkpoints", "training"), ("inspect.json", "log"),
-           ("evaluation.json", "evaluation"), ("report.json", "fit"))  # fmt: skip
+           ("evaluation.json", "evaluation"), ("report.json", "fit"), ("command.html", "next drive"))  # fmt: skip
 """Kind of a folder without a word on it, by a name in it; the first one counts."""
 PAGES = ("index.html", "report.html", "inspect.html", "paper.html", "searches.html", "command.html")
 RESULTS = {"training": "evaluation.json", "evaluation": "evaluation.json", "fit": "report.json",

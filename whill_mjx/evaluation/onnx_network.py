@@ -37,8 +37,8 @@ class Network:
         for node in graph.node:
             if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
                 raise ValueError(
-                    f"{name}: operator {node.domain or 'ai.onnx'}::{node.op_type} is not known here (known: "
-                    f"{', '.join(sorted(OPERATORS))}). Evaluate with the runtime 'onnxruntime' instead."
+                    f"{name}: operator {node.domain or 'ai.onnx'}::{node.op_type} is not known here, so the network "
+                    "cannot be compiled with the simulator. Evaluate with the runtime 'onnxruntime' instead."
                 )
             attributes = {item.name: helper.get_attribute_value(item) for item in node.attribute}
             for key, value in attributes.items():
@@ -208,12 +208,41 @@ def _clip(xp, attributes, count, values, low=None, high=None):
     return values if high is None else xp.minimum(values, high)
 
 
+def _flatten(xp, attributes, count, values):
+    axis = attributes.get("axis", 1) % (values.ndim + 1)
+    return xp.reshape(values, (int(np.prod(values.shape[:axis])), -1))
+
+
+def _elu(xp, attributes, count, values):
+    return xp.where(values > 0, values, attributes.get("alpha", 1.0) * xp.expm1(xp.minimum(values, 0)))
+
+
+def _layer_normalization(xp, attributes, count, values, scale, bias=None):
+    axes = tuple(range(attributes.get("axis", -1) % values.ndim, values.ndim))
+    variance = xp.var(values, axis=axes, keepdims=True) + attributes.get("epsilon", 1e-5)
+    result = (values - xp.mean(values, axis=axes, keepdims=True)) / xp.sqrt(variance) * scale
+    return result if bias is None else result + bias
+
+
+def _batch_normalization(xp, attributes, count, values, *statistics):
+    scale, bias, mean, variance = (xp.reshape(one, (-1, *[1] * (values.ndim - 2))) for one in statistics)
+    return (values - mean) / xp.sqrt(variance + attributes.get("epsilon", 1e-5)) * scale + bias
+
+
+def _mod(xp, attributes, count, a, b):
+    return xp.fmod(a, b) if attributes.get("fmod", 0) else xp.mod(a, b)
+
+
 OPERATORS: dict[str, Operator] = {
     "Abs": _elementwise("abs"),
     "Add": _elementwise("add"),
     "And": _elementwise("logical_and"),
     "ArgMax": _argmax,
+    "Atan": _elementwise("arctan"),
+    "BatchNormalization": _batch_normalization,
     "Cast": _cast,
+    "CastLike": lambda xp, a, count, values, like: values.astype(like.dtype),
+    "Ceil": _elementwise("ceil"),
     "Clip": _clip,
     "Concat": lambda xp, a, count, *values: xp.concatenate(values, axis=a["axis"]),
     "Constant": lambda xp, a, count: np.asarray(next(iter(a.values()))),
@@ -221,23 +250,31 @@ OPERATORS: dict[str, Operator] = {
     "Conv": _conv,
     "Cos": _elementwise("cos"),
     "Div": _div,
+    "Dropout": lambda xp, a, count, values, *unused: values,
     "Einsum": lambda xp, a, count, *values: xp.einsum(a["equation"].decode(), *values),
+    "Elu": _elu,
     "Equal": _elementwise("equal"),
+    "Erf": lambda xp, a, count, values: jax.scipy.special.erf(jnp.asarray(values)),
     "Exp": _elementwise("exp"),
     "Expand": _expand,
+    "Flatten": _flatten,
     "Floor": _elementwise("floor"),
     "Gather": lambda xp, a, count, values, index: xp.take(values, index, axis=a.get("axis", 0)),
     "Gemm": _gemm,
     "Greater": _elementwise("greater"),
     "GreaterOrEqual": _elementwise("greater_equal"),
     "Identity": lambda xp, a, count, value: value,
+    "LayerNormalization": _layer_normalization,
+    "LeakyRelu": lambda xp, a, count, values: xp.where(values > 0, values, a.get("alpha", 0.01) * values),
     "Less": _elementwise("less"),
     "LessOrEqual": _elementwise("less_equal"),
     "Log": _elementwise("log"),
+    "LogSoftmax": lambda xp, a, count, values: jax.nn.log_softmax(jnp.asarray(values), axis=a.get("axis", -1)),
     "MatMul": _elementwise("matmul"),
     "Max": _folded("maximum"),
     "Mean": lambda xp, a, count, *values: _folded("add")(xp, a, count, *values) / len(values),
     "Min": _folded("minimum"),
+    "Mod": _mod,
     "Mul": _elementwise("multiply"),
     "Neg": _elementwise("negative"),
     "Not": _elementwise("logical_not"),
@@ -249,9 +286,11 @@ OPERATORS: dict[str, Operator] = {
     "ReduceMax": _reduction("max"),
     "ReduceMean": _reduction("mean"),
     "ReduceMin": _reduction("min"),
+    "ReduceProd": _reduction("prod"),
     "ReduceSum": _reduction("sum"),
     "Relu": lambda xp, a, count, value: xp.maximum(value, 0),
     "Reshape": _reshape,
+    "Round": _elementwise("rint"),
     "Shape": lambda xp, a, count, value: np.asarray(value.shape[slice(a.get("start", 0), a.get("end"))], np.int64),
     "Sigmoid": lambda xp, a, count, value: jax.nn.sigmoid(jnp.asarray(value)),
     "Sign": _elementwise("sign"),
@@ -264,7 +303,9 @@ OPERATORS: dict[str, Operator] = {
     "Squeeze": _squeeze,
     "Sub": _elementwise("subtract"),
     "Sum": _folded("add"),
+    "Tan": _elementwise("tan"),
     "Tanh": _elementwise("tanh"),
+    "Tile": lambda xp, a, count, values, repeats: xp.tile(values, _ints(repeats)),
     "Transpose": lambda xp, a, count, values: xp.transpose(values, a.get("perm")),
     "Unsqueeze": _unsqueeze,
     "Where": _elementwise("where"),

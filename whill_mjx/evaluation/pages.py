@@ -61,7 +61,7 @@ def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: i
         axes.set_title(f"{ENDED[how]}, {episodes.ends['time_s'][index]:.1f} s", fontsize=8, color=ENDINGS[how])
         _scale_bar(axes)
     figure.get_layout_engine().set(h_pad=0.12)
-    _legend(figure, {ending(episodes, index) for index in range(count)})
+    _legend(figure, {ending(episodes, index) for index in range(count)}, min(3, columns))
     return _save(figure, out)
 
 
@@ -72,8 +72,8 @@ def _scale_bar(axes: Any, metres: float = 1.0) -> None:
     axes.text(x + metres / 2, y + 0.08, f"{metres:g} m", ha="center", va="bottom", fontsize=6)
 
 
-def _legend(figure: Any, endings: set[str]) -> None:
-    """Say below the maps what lines and marks mean."""
+def _legend(figure: Any, endings: set[str], columns: int) -> None:
+    """Say below the maps, in `columns` columns, what lines and marks mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -81,11 +81,11 @@ def _legend(figure: Any, endings: set[str]) -> None:
                           for how, colour in ENDINGS.items() if how in endings]  # fmt: skip
     handles += [
         Line2D([], [], color="grey", marker="o", linestyle="", markersize=4,
-               label="end of the drive axle's path (the body reaches farther)"),
+               label="end of the drive axle; the body is longer"),
         Line2D([], [], color="tab:blue", marker="s", linestyle=":", markersize=4, label="goal and its region"),
         Patch(color="grey", label="boxes and walls, in their colours"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)), fontsize=8)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8)
 
 
 def sweep_picture(sweep: Sweep, out: Path, name: str) -> Path:
@@ -193,8 +193,8 @@ WORDS = {
 """Words for the figures of a summary."""
 DRIVERS = {
     "policy": "the policy", "planner": "planner that knows the scene", "random": "random actions",
-    "blank": "it sees black images", "freeze": "it sees only its first image",
-    "replay": "it drives actions of another episode",
+    "blank": "with black images", "freeze": "with its first image alone",
+    "replay": "with another episode's actions",
 }  # fmt: skip
 """Words for drivers and for proofs of sight."""
 CAPTIONS = {
@@ -218,6 +218,8 @@ def page(evaluation: dict[str, Any], pictures: list[Path], videos: list[Path], o
     subtitle = f"{first['episodes']} episodes with each driver; computed on {device}"
     main_name = next(iter(drivers))
     lead = f"{_driver(main_name).capitalize()} succeeds in {_shown('success', first['success'])} of the episodes."
+    blind = [one["success"] for name, one in drivers.items() if name.startswith(f"{main_name} ")]
+    lead += f" Without sight it succeeds in at most {_shown('success', max(blind))}." if blind else ""
     title = f"Evaluation of {evaluation['policy']} in the task {task}"
     write_whole(out, html.html_page(title, sections, subtitle, kind="Evaluation", lead=lead))
     return out
@@ -227,12 +229,9 @@ def _figures(drivers: dict[str, Any]) -> str:
     first = next(iter(drivers.values()))
     rows: list[list[Any]] = []
     for name in (name for name in WORDS if f"{name}_interval_95" in first):
-        row: list[Any] = [WORDS[name]]
-        for figures in drivers.values():
-            row += [_shown(name, figures[name]), html.Cell(_interval(name, figures[f"{name}_interval_95"]), "i")]
-        rows.append(row)
-    header = ["figure", *(text for name in drivers for text in (_driver(name), "95 % interval"))]
-    return html.table(header, rows)
+        cells = [_with_interval(name, one[name], one[f"{name}_interval_95"]) for one in drivers.values()]
+        rows.append([WORDS[name], *cells])
+    return html.table(["figure", *map(_driver, drivers)], rows, "in brackets: the 95% interval")
 
 
 def _meanings(first: dict[str, Any]) -> str:
@@ -245,7 +244,7 @@ def _driver(name: str) -> str:
     """A driver in words: "policy freeze" is the policy without sight."""
     base, _, blind = name.partition(" ")
     text = DRIVERS.get(base, base)
-    return f"{text}: {DRIVERS[blind]}" if blind in DRIVERS else text
+    return f"{text} {DRIVERS[blind]}" if blind in DRIVERS else text
 
 
 def _caption(path: Path) -> str:
@@ -258,8 +257,9 @@ def _caption(path: Path) -> str:
 def _shown(name: str, value: float | None) -> str:
     if value is None:
         return "–"
-    return f"{100 * value:.1f} %" if name in SHARES else html.number(float(value))
+    return f"{value:.1%}" if name in SHARES else html.number(float(value))
 
 
-def _interval(name: str, interval: list[float] | None) -> str:
-    return "–" if interval is None else f"{_shown(name, interval[0])} to {_shown(name, interval[1])}"
+def _with_interval(name: str, value: float | None, interval: list[float] | None) -> str:
+    between = "" if interval is None else f" ({_shown(name, interval[0])} to {_shown(name, interval[1])})"
+    return _shown(name, value) + between

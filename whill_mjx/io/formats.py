@@ -37,6 +37,7 @@ FORMATS = {one.kind: one for one in (
     Format("dreamer-onnx-policy", "policy.json", 1, "an agent of any observations ([fields](policy_file.md))"),
     Format("sysid-report", "report.json", 1, "a fit (fields: `python -m sysid.report --help`)"),
     Format("sysid-close-loop", "report.json", 1, "a closed loop (fields: head of `sysid/pages/loop_report.py`)"),
+    Format("sysid-evidence", "evidence.json", 1, "evidence of a verdict (fields: `sysid.verdict.posterior.Findings`)"),
     Format("sysid-paper", "paper.json", 1, "the paper's experiment"),
     Format("sysid-searches", "searches.json", 1, "a comparison of searches"),
     Format("sysid-inspection", "inspect.json", 1, "an inspected log (fields: `sysid.logs.inspection.inspect`)"),

@@ -72,10 +72,17 @@ class Heartbeat:
                 continue
             bars = _open_bars()
             for bar in bars:
-                bar.refresh()
+                _refresh(bar)
             if not bars and self._text:
                 say(f"  {now - self._began:.0f} s: {self._text}")
             self._wrote = now
+
+
+def _refresh(bar: Any) -> None:
+    """Draw a bar again. A terminal may state no size, as in some containers; tqdm then hides its bars."""
+    if min(bar.ncols or 1, bar.nrows or 1) < 1:
+        bar.dynamic_ncols, bar.ncols, bar.nrows = None, 80, 20
+    bar.refresh()
 
 
 def _open_bars() -> list[Any]:

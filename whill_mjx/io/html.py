@@ -32,10 +32,9 @@ p { max-width: 62rem; margin: .5rem 0; } .lead { font-size: 1.1rem; margin: .4re
 .scroll { overflow-x: auto; overflow-wrap: normal; }
 table { border-collapse: collapse; font-size: .86rem; margin: .5rem 0; }
 th, td { padding: .18rem .6rem; border-bottom: 1px solid #e6e6e6; text-align: left; vertical-align: middle; }
-th { font-weight: 600; border-bottom: 1px solid #9a9a9a; white-space: nowrap; }
+th { font-weight: 600; border-bottom: 1px solid #9a9a9a; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; } th.n { text-align: right; }
 caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; max-width: min(62rem, calc(100vw - 1.7rem)); }
-td.i { white-space: nowrap; }
 td.differs { background: #fff3d1; } td.differs:first-child { border-left: .25rem solid #e0a014; }
 details { margin: .6rem 0; } summary { cursor: pointer; color: #1f5f9f; }
 td.good { color: #176b32; } td.bad { color: #a31621; font-weight: 600; } td.warn { color: #8a5a00; }
@@ -54,7 +53,7 @@ svg .grid { stroke: #e4e4e4; stroke-width: 1; } svg .band { fill: #1f6fb4; opaci
 @media print { @page { margin: 14mm; } body { font-size: 10pt; max-width: none; padding: 0; }
   nav, video { display: none; }
   h2, h3, caption { break-after: avoid; } figure, tr, svg, img { break-inside: avoid; } .scroll { overflow: visible; }
-  table { font-size: 8pt; } a { color: inherit; text-decoration: none; } th { white-space: normal; }
+  table { font-size: 8pt; } a { color: inherit; text-decoration: none; }
   .legend { break-after: avoid; } }
 """
 

@@ -75,7 +75,7 @@ def _result(out: Path, evaluation: dict[str, Any]) -> str:
         seconds = one["time_to_goal_s"]
         rows.append([DRIVERS[name], f"{one['success']:.0%}", f"{low:.0%} to {high:.0%}", f"{one['collision']:.0%}",
                      f"{one['timeout']:.0%}", "–" if seconds is None else f"{seconds:.1f} s", one["return"]])
-    header = ["driver", "success", "95 % interval", "collision", "time-out", "time to the goal", "return"]
+    header = ["driver", "success", "95% interval", "collision", "time-out", "time to the goal", "return"]
     command = f"python -m whill_mjx.evaluate {out / 'policy'} --html"
     return html.table(header, rows) + html.paragraph(f"More episodes, proofs of sight and sweeps: {command}", "dim")
 

@@ -166,7 +166,7 @@ class Task:
         return goal_position(scene)
 
     def rewards(self, moment: Moment) -> dict[str, jax.Array]:
-        """Terms () of the reward of one control period by name; their sum is the reward.
+        """Terms () of the reward of one control period by name, without a unit; their sum is the reward.
 
         The defaults are the paper's. A collision outweighs an arrival.
         """
@@ -174,7 +174,7 @@ class Task:
         return reward_terms(self, terms.progress(moment), change, moment.reached, moment.collided)
 
     def endings(self, moment: Moment) -> dict[str, jax.Array]:
-        """Flags () by name: an episode ends, and is counted, by the first one that holds.
+        """Flags () bool by name: an episode ends, and is counted, by the first one that holds.
 
         "success" is what evaluations count as such. "timeout" and "diverged" are the library's own.
         """

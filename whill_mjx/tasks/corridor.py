@@ -15,7 +15,7 @@ from whill_mjx.world.scene import Scene, box, default_looks, stack_boxes
 
 @dataclass(frozen=True)
 class Corridor(Task):
-    """A cardboard box between the vehicle and a blue square 4.5 m ahead.
+    """Drive around a cardboard box to a blue square 4.5 m ahead, in a corridor.
 
     The paper does not give the corridor's width; it is chosen here and stays, so that figures compare.
     """

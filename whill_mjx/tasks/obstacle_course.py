@@ -17,7 +17,7 @@ _EASY = {"v_min": 0.0, "gates": 1}
 
 @dataclass(frozen=True)
 class ObstacleCourse(Task):
-    """Two gates on the way to a goal 5.3 m ahead, between walls. Driving straight on hits the first gate.
+    """Drive through two gates to a goal 5.3 m ahead, between walls. Driving straight on hits the first gate.
 
     A gate is a pair of low boxes, one to each side of a gap, that leave no second way through. The boxes are lower than
     the camera, so the goal marker above them is in sight from the start, and so is the second gap above the first gate.

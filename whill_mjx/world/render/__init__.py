@@ -6,6 +6,7 @@
     shading     colour of what a ray meets: light, shadow, texture, fog, anti-aliasing
     culling     which primitives a part of the image can show
     image       the renderer in jnp
+    blocks      loops over images on a processor
     pallas      the same as a GPU kernel
     draw        the one of the two that suits the device
 """

@@ -1,26 +1,27 @@
 """The camera in jnp, for any device: scene and camera pose of one instance -> image, depth, labels, normals.
 
 Written so that XLA fuses the loop over boxes into one kernel on CPUs and GPUs. A flat face has one colour under a
-distant sun; it is looked up after the loop. There is no [P, H, W] array and no division in the loop.
+distant sun; it is looked up after the loop. There is no [P, H, W] array and no division in the loop. On a processor
+images are drawn in blocks (`blocks`), and the tables are complete before the first pixel.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from whill_mjx.world.render import visibility
+from whill_mjx.world.render.blocks import in_blocks
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.render.culling import strip_lists, upright_bounds
 from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
-from whill_mjx.world.render.textures import whole
-from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal
+from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal, larger, smaller
 from whill_mjx.world.scene import Scene
 
 UNROLL = 8
@@ -64,10 +65,7 @@ def render(
         ValueError: more primitives than labels, or a finish of another scene.
     """
     view, finite = make_view(position, rotation, intrinsics, scene)
-    stage = _stage(view, scene, width, quality)
-    row, column = _grid(height, width)
-    word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
-    return unpack_colours(jnp.where(finite, word, jnp.uint32(0)))
+    return unpack_colours(_words(view, finite, _stage(view, scene, width, quality), (height, width), quality))
 
 
 def render_frame(
@@ -87,8 +85,8 @@ def render_frame(
     """
     view, finite = make_view(position, rotation, intrinsics, scene)
     stage = _stage(view, scene, width, quality, normals)
+    word = _words(view, finite, stage, (height, width), quality)
     row, column = _grid(height, width)
-    word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
     rays = pixel_view(view, stage, row, column)
     hit = cast(view, stage, rays)
     label = jnp.where(hit.solid, hit.code >> 2, jnp.where(hit.seen, GROUND, SKY))
@@ -101,7 +99,7 @@ def render_frame(
         normal = jnp.stack(face_normal(stage.row(code), *point), -1)
         normal = jnp.where(finite, normal, 0.0)
     return Frame(
-        unpack_colours(jnp.where(finite, word, jnp.uint32(0))),
+        unpack_colours(word),
         jnp.where(finite, hit.depth, jnp.inf),
         jnp.where(finite, label, SKY).astype(kind),
         normal,
@@ -126,8 +124,20 @@ def unpack_colours(word: jax.Array) -> jax.Array:
     return jax.lax.bitcast_convert_type(word, jnp.uint8)[..., :3]
 
 
+def _words(view: View, finite: jax.Array, stage: Arrays, size: tuple[int, int], quality: Quality) -> jax.Array:
+    """(H, W) uint32 colours of an image."""
+
+    def drawn(rows: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
+        word = pack_channels(stage, pixel_colours(view, stage, quality, rows[:, None], columns))
+        return jnp.where(finite, word, jnp.uint32(0))
+
+    rows, columns = _grid(*size)
+    return in_blocks(drawn)(rows[:, 0], view, finite, stage)
+
+
 def _grid(height: int, width: int) -> tuple[jax.Array, jax.Array]:
-    return (jax.lax.broadcasted_iota(jnp.float32, (height, width), axis) for axis in (0, 1))  # type: ignore[return-value]
+    """Rows (H, 1) and columns (1, W): what a whole row or column shares is computed once."""
+    return jnp.arange(float(height))[:, None], jnp.arange(float(width))[None, :]
 
 
 def _stage(view: View, scene: Scene, width: int, quality: Quality, rows: bool = False) -> Arrays:
@@ -141,18 +151,18 @@ def _stage(view: View, scene: Scene, width: int, quality: Quality, rows: bool = 
         bounds = upright_bounds(view, parts.boxes)
         lists = jax.lax.optimization_barrier(strip_lists(bounds, view, width, quality.strips, quality.keep))
     atlas = None if scene.finish is None else scene.finish.atlas
-    return Arrays(parts, tables, lit_words(scene), lists, atlas)
+    return Arrays(parts, tables, lists, atlas, lit_words(scene))
 
 
-@dataclass(frozen=True, eq=False)
+@struct.dataclass
 class Arrays:
     """The stage of the jnp renderer: tables are arrays, and every pixel meets every primitive of its strip."""
 
     parts: Parts
     tables: Tables
-    lit_words: bool
     lists: jax.Array | None  # (strips, keep) boxes of each strip, or None: all
     atlas: jax.Array | None
+    lit_words: bool = struct.field(pytree_node=False)
 
     @property
     def bits(self) -> int:
@@ -198,13 +208,16 @@ class Arrays:
         return x / y
 
     def whole(self, x) -> jax.Array:
-        return whole(x)
+        """By the mantissa, within 2^22 of 0: XLA's conversion also minds NaN and overflow, which takes it longer."""
+        floor = larger(smaller(jnp.floor(x), np.float32(2.0**22 - 1.0)), np.float32(-(2.0**22)))
+        return jax.lax.bitcast_convert_type(floor + np.float32(1.5 * 2.0**23), jnp.int32) - np.int32(0x4B400000)
 
     def small(self, integer) -> jax.Array:
-        return integer.astype(jnp.float32)
+        return integer.astype(jnp.int32).astype(jnp.float32)
 
     def level(self, value) -> jax.Array:
-        return (jnp.clip(value, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.int32)
+        floor = jnp.floor(larger(smaller(value, 1.0), 0.0) * 255.0 + 0.5)
+        return jax.lax.bitcast_convert_type(floor + np.float32(2.0**23), jnp.int32) & np.int32(255)
 
     def settle(self, values) -> Any:
         return jax.lax.optimization_barrier(values)
@@ -252,10 +265,9 @@ def _nearest_upright(rays: Rays, table, order, bits: int) -> jax.Array:
     table = jnp.concatenate([table, padding])
     if order is not None:
         order = jnp.concatenate([order, jnp.zeros(padding.shape[0], order.dtype)])
-    reach_z = jnp.abs(rays.inverse_z)
 
     def one_round(index, key):
-        first = index * size
+        first, reach_z = index * size, jnp.abs(rays.inverse_z)
         part = jax.lax.dynamic_slice(table, (first, 0), (size, table.shape[1]))
         places = None if order is None else jax.lax.dynamic_slice(order, (first,), (size,))
         for offset in range(size):
@@ -264,7 +276,7 @@ def _nearest_upright(rays: Rays, table, order, bits: int) -> jax.Array:
             key = jnp.minimum(key, visibility.upright_key(rays, reach_z, part[offset], code, bits))
         return key
 
-    return jax.lax.fori_loop(0, rounds, one_round, jnp.full(rays.u.shape, FAR, jnp.int32))
+    return jax.lax.fori_loop(0, rounds, one_round, jnp.full(rays.x.shape, FAR, jnp.int32))
 
 
 def _least(key, key_of_one, table) -> jax.Array:
@@ -278,7 +290,8 @@ def _least(key, key_of_one, table) -> jax.Array:
 
 def _nearest_in_strips(rays: Rays, table, lists, bits: int) -> jax.Array:
     """The same, with the boxes of `lists` (strips, keep) alone in each upright strip; -1 is no box."""
-    shape, width = rays.u.shape, rays.u.shape[-1]
+    shape, width = rays.x.shape, rays.x.shape[-1]
+    rays = Rays(*jnp.broadcast_arrays(*rays))
     strips = lists.shape[0]
     unused = jnp.zeros(table.shape[1]).at[9:].set(-1.0)
     tables = jnp.where((lists >= 0)[..., None], table[lists], unused)

@@ -345,7 +345,7 @@ class Refs:
         return None if self.data.bent is None else 4 * self.starts["round"]
 
     def nearest(self, rays: Rays) -> jax.Array:
-        bits, invert = self.bits, self.invert
+        bits, how = self.bits, visibility.Arithmetic(self.invert, jnp.maximum, jnp.minimum)
         reach_z = jnp.abs(rays.inverse_z)
         square = visibility.ray_square(rays)
         tests = {
@@ -358,7 +358,7 @@ class Refs:
 
             def meet(place, least, name=name, kind=kind):
                 numbers = [kind.table[place, j] for j in range(kind.table.shape[-1])]
-                return jnp.minimum(least, tests[name](numbers, 4 * (self.starts[name] + place), bits, invert))
+                return jnp.minimum(least, tests[name](numbers, 4 * (self.starts[name] + place), bits, how))
 
             key = self._visit(kind.bounds, kind.order, meet, key, partial(self._farthest, rays))
         return key

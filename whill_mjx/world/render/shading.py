@@ -138,7 +138,7 @@ def pixel_colours(view: View, stage: Stage, quality: Quality, row, column) -> li
     if not quality.antialias:
         centre = pixel_view(view, stage, row, column)
         return shade(view, stage, quality, centre, cast(view, stage, centre))
-    shape = (len(SAMPLES), *row.shape)
+    shape = (len(SAMPLES), *jnp.broadcast_shapes(row.shape, column.shape))
     sample = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
     rays = pixel_view(view, stage, row[None], column[None], _place(sample))
     key = stage.settle(cast(view, stage, rays).key)

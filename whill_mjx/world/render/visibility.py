@@ -77,6 +77,28 @@ def reciprocal(x: jax.Array) -> jax.Array:
     return guess + guess * (1.0 - x * guess)
 
 
+def larger(x, y) -> jax.Array:
+    """The larger of two numbers, y where one is NaN: an instruction of a processor, where `jnp.maximum` takes five."""
+    return jnp.where(x > y, x, y)
+
+
+def smaller(x, y) -> jax.Array:
+    """The smaller of two numbers, y where one is NaN."""
+    return jnp.where(x < y, x, y)
+
+
+class Arithmetic(NamedTuple):
+    """What processors and GPUs do fastest in different ways."""
+
+    invert: Callable = reciprocal
+    """x -> 1 / x."""
+    larger: Callable = larger
+    smaller: Callable = smaller
+
+
+PROCESSOR = Arithmetic()
+
+
 def face_normal(row, x, y, z) -> list:
     """Unit normal of a face at a point: that of a flat face, or the direction away from a round's axis."""
     dx, dy, dz = x - row[3], y - row[4], z - row[5]
@@ -114,17 +136,21 @@ def upright_table(position: jax.Array, rotation: jax.Array, boxes: Boxes) -> jax
     return jnp.concatenate([row_x + tiny, row_y + tiny, middle, half], 1)
 
 
-def upright_key(rays: Rays, reach_z, numbers, code, bits: int = 10, invert: Callable = reciprocal) -> jax.Array:
+def upright_key(rays: Rays, reach_z, numbers, code, bits: int = 10, how: Arithmetic = PROCESSOR) -> jax.Array:
     """Key of one upright box, FAR where the ray misses it: the slab test in the box's own frame.
 
     A box turned only about the vertical shows at most one of its two faces per axis: label and face are enough.
     `reach_z` is |inverse_z|, the same for all boxes.
     """
-    ray_x = numbers[0] * rays.u + numbers[1] * rays.v + numbers[2]
-    ray_y = numbers[3] * rays.u + numbers[4] * rays.v + numbers[5]
-    both = invert(ray_x * ray_y)  # one reciprocal serves both axes
+    ray_x, ray_y = _along(rays, numbers[:3]), _along(rays, numbers[3:6])
+    both = how.invert(ray_x * ray_y)  # one reciprocal serves both axes
     inverse_x, inverse_y = both * ray_y, both * ray_x
-    return _slabs((inverse_x, inverse_y, rays.inverse_z), reach_z, numbers[6:], code, bits)
+    return _slabs((inverse_x, inverse_y, rays.inverse_z), reach_z, numbers[6:], (code, bits), how)
+
+
+def _along(rays: Rays, axis) -> jax.Array:
+    """Products of the rays with an axis in the camera's frame; what a row of pixels shares is summed first."""
+    return axis[0] * rays.u + (axis[1] * rays.v + axis[2])
 
 
 # Blocks: 15 numbers each.
@@ -139,25 +165,27 @@ def block_table(position: jax.Array, rotation: jax.Array, blocks: Blocks) -> jax
     return jnp.concatenate([rows.reshape(-1, 9), middle, half], 1)
 
 
-def block_key(rays: Rays, numbers, code, bits: int = 10, invert: Callable = reciprocal) -> jax.Array:
+def block_key(rays: Rays, numbers, code, bits: int = 10, how: Arithmetic = PROCESSOR) -> jax.Array:
     """Key of one block of any rotation, FAR where the ray misses it."""
-    x, y, z = (numbers[3 * i] * rays.u + numbers[3 * i + 1] * rays.v + numbers[3 * i + 2] for i in range(3))
-    every = invert(x * y * z)
+    x, y, z = (_along(rays, numbers[3 * i : 3 * i + 3]) for i in range(3))
+    every = how.invert(x * y * z)
     inverse_z = every * x * y
     inverse = (every * y * z, every * x * z, inverse_z)
-    return _slabs(inverse, jnp.abs(inverse_z), numbers[9:], code, bits)
+    return _slabs(inverse, jnp.abs(inverse_z), numbers[9:], (code, bits), how)
 
 
-def _slabs(inverse, reach_z, numbers, code, bits):
+def _slabs(inverse, reach_z, numbers, name, how: Arithmetic):
     """Key from reciprocals of the ray in the box's frame; `numbers`: middle (3) and half sizes (3)."""
+    code, bits = name
     inverse_x, inverse_y, inverse_z = inverse
     middle_x, middle_y, middle_z = numbers[0] * inverse_x, numbers[1] * inverse_y, numbers[2] * inverse_z
     reach_x, reach_y = numbers[3] * jnp.abs(inverse_x), numbers[4] * jnp.abs(inverse_y)
     reach_z = numbers[5] * reach_z
     near_x, near_y, near_z = middle_x - reach_x, middle_y - reach_y, middle_z - reach_z
-    far = jnp.minimum(jnp.minimum(middle_x + reach_x, middle_y + reach_y), middle_z + reach_z)
-    near = jnp.maximum(jnp.maximum(near_x, near_y), jnp.maximum(near_z, 0.0))
-    face = jnp.where(near_x > jnp.maximum(near_y, near_z), 0, jnp.where(near_y > near_z, 1, 2))
+    far = how.smaller(how.smaller(middle_x + reach_x, middle_y + reach_y), middle_z + reach_z)
+    beside = how.larger(near_y, near_z)
+    near = how.larger(how.larger(near_x, beside), 0.0)
+    face = jnp.where(near_x > beside, 0, jnp.where(near_y > near_z, 1, 2))
     return jnp.where(near < far, key_of(near, code + face, bits), np.int32(FAR))
 
 
@@ -185,13 +213,12 @@ def ray_square(rays: Rays) -> tuple[jax.Array, jax.Array]:
     return square, reciprocal(square)
 
 
-def round_key(rays: Rays, square, numbers, code, bits: int = 10, invert: Callable = reciprocal) -> jax.Array:
+def round_key(rays: Rays, square, numbers, code, bits: int = 10, how: Arithmetic = PROCESSOR) -> jax.Array:
     """Key of one cylinder or capsule, FAR where the ray misses it. `square`: u^2 + v^2 + 1 and its inverse."""
-    ray_axis = numbers[0] * rays.u + numbers[1] * rays.v + numbers[2]
-    ray_centre = numbers[3] * rays.u + numbers[4] * rays.v + numbers[5]
+    ray_axis, ray_centre = _along(rays, numbers[:3]), _along(rays, numbers[3:6])
     seen = RoundSeen(*(numbers[i] for i in range(6, 11)))
     length2, inverse = square
-    distance, flat = round_distance(length2, inverse, ray_axis, ray_centre, seen, invert)
+    distance, flat = round_distance(length2, inverse, ray_axis, ray_centre, seen, how)
     distance = jnp.where(numbers[11] > 0, 0.0, distance)
     hit = (distance < 1e9) & (distance >= 0)
     return jnp.where(hit, key_of(distance, code + jnp.where(flat, FLAT_END, CURVED), bits), np.int32(FAR))
@@ -207,29 +234,29 @@ class RoundSeen(NamedTuple):
     capsule: jax.Array  # positive for round ends
 
 
-def round_distance(square, inverse_square, ray_axis, ray_centre, seen: RoundSeen, invert: Callable = reciprocal):
+def round_distance(square, inverse_square, ray_axis, ray_centre, seen: RoundSeen, how: Arithmetic = PROCESSOR):
     """Where rays enter a round, and whether through a flat end; 1e9 where they miss it, negative behind the origin.
 
     Args:
         square, inverse_square: product of the ray direction with itself, and its inverse.
         ray_axis, ray_centre: its products with the axis, and with the centre as seen from the ray's origin.
         seen: the round.
-        invert: x -> 1 / x.
+        how: arithmetic of the device.
     """
     along, centre2, radius2, half, capsule = seen
-    a = jnp.maximum(square - ray_axis * ray_axis, 1e-9)
+    a = how.larger(square - ray_axis * ray_axis, 1e-9)
     b = ray_centre - ray_axis * along
     c = centre2 - along * along - radius2
     root = b * b - a * c
-    side = (b - jnp.sqrt(jnp.maximum(root, 0.0))) * invert(a)
+    side = (b - jnp.sqrt(how.larger(root, 0.0))) * how.invert(a)
     height = side * ray_axis - along  # above the middle
     on_side = (root > 0) & (jnp.abs(height) <= half)
     end = jnp.where(height > 0, half, -half)  # a ray that enters beyond an end can only meet that end
     ball_b = ray_centre + end * ray_axis
     ball_c = centre2 + end * (2.0 * along + end) - radius2
     ball_root = ball_b * ball_b - square * ball_c
-    ball = (ball_b - jnp.sqrt(jnp.maximum(ball_root, 0.0))) * inverse_square
-    disc = (along + end) * invert(jnp.where(jnp.abs(ray_axis) < 1e-7, 1e-7, ray_axis))
+    ball = (ball_b - jnp.sqrt(how.larger(ball_root, 0.0))) * inverse_square
+    disc = (along + end) * how.invert(jnp.where(jnp.abs(ray_axis) < 1e-7, 1e-7, ray_axis))
     off_axis = disc * (disc * square - 2.0 * ray_centre) + centre2 - end * end  # squared distance from the axis
     cap = jnp.where(capsule > 0, ball, disc)
     on_cap = (root > 0) & jnp.where(capsule > 0, ball_root > 0, off_axis <= radius2)

@@ -1,0 +1,109 @@
+"""A long recording in trials: one for each drive between two standstills."""
+
+import itertools
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bridge.trial_writer import COLUMNS, TrialWriter
+
+STANDING = (0.01, 0.02)
+"""Speeds below which a vehicle counts as standing: v [m/s], omega [rad/s]; odometry is never quite silent."""
+
+
+class SplitWriter:
+    """Takes what a `TrialWriter` takes, and makes a trial of each drive.
+
+    A trial begins so many seconds before the first motion, and ends when the vehicle has stood for as long. What comes
+    while it stands longer is dropped.
+    """
+
+    def __init__(self, dataset: str | Path, stem: str, seconds: float,
+                 on_trial: Callable[[Path, Mapping[str, int]], None], clock: Callable[[], float] = time.monotonic
+                 ) -> None:
+        """Write trials STEM_1, STEM_2 and so on; numbers that are taken are left out.
+
+        Args:
+            dataset: folder of the dataset.
+            stem: of the names of its trials.
+            seconds: of standstill that end a drive.
+            on_trial: called with the folder and the rows of each trial that is whole.
+            clock: steady clock [s].
+
+        Raises:
+            ValueError: the name is no plain file name.
+        """
+        TrialWriter.check(dataset, f"{stem}_0")
+        self.rows: Counter[str] = Counter(dict.fromkeys(COLUMNS, 0))
+        """Of all whole trials."""
+        self.trials: list[Path] = []
+        self._dataset, self._stem, self._seconds, self._on_trial, self._clock = dataset, stem, seconds, on_trial, clock
+        self._writer: TrialWriter | None = None
+        self._waiting: deque[tuple[float, str, tuple[Any, ...]]] = deque()
+        self._moved = 0.0
+
+    def command(self, t: float, v: float, omega: float) -> None:
+        """Add a command."""
+        self._take("command", (t, v, omega), bool(v or omega))
+
+    def odometry(self, t: float, *values: float) -> None:
+        """Add what the odometry reports: x, y [m], yaw [rad], v [m/s], omega [rad/s] and, where it has one, a stamp."""
+        v, omega = values[3:5]
+        self._take("odometry", (t, *values), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
+
+    def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
+        """Add an outside measurement."""
+        self._take("ground_truth", (t, x, y, yaw, stamp))
+
+    def imu(self, t: float, gyro: float, stamp: float = 0.0) -> None:
+        """Add a yaw rate."""
+        self._take("imu", (t, gyro, stamp))
+
+    def message(self, topic: str, kind: Any, data: bytes) -> None:
+        """Add a whole message."""
+        self._take("message", (topic, kind, data))
+
+    def flush(self) -> None:
+        """Hand the rows so far to the operating system; end the drive where nothing has come for long."""
+        if self._writer is not None:
+            self._writer.flush()
+            self._end_if_over(self._clock())
+
+    def close(self) -> Path | None:
+        """End the last trial, where a drive goes on; return its folder."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return None
+        folder = writer.close()
+        self.trials.append(folder)
+        self.rows.update(writer.rows)
+        self._on_trial(folder, writer.rows)
+        return folder
+
+    def _take(self, name: str, values: tuple[Any, ...], moves: bool = False) -> None:
+        now = self._clock()
+        if moves:
+            self._moved = now
+            if self._writer is None:
+                self._begin()
+        if self._writer is not None:
+            getattr(self._writer, name)(*values)
+            self._end_if_over(now)
+            return
+        self._waiting.append((now, name, values))
+        while now - self._waiting[0][0] > self._seconds:
+            self._waiting.popleft()
+
+    def _begin(self) -> None:
+        trials = Path(self._dataset) / "trials"
+        name = next(name for name in (f"{self._stem}_{k}" for k in itertools.count(1)) if not (trials / name).exists())
+        self._writer = TrialWriter(self._dataset, name)
+        for _, what, values in self._waiting:
+            getattr(self._writer, what)(*values)
+        self._waiting.clear()
+
+    def _end_if_over(self, now: float) -> None:
+        if now - self._moved > self._seconds:
+            self.close()

@@ -1,0 +1,86 @@
+"""Links of a URDF as simulators take them: with a shape that touches, and a possible mass and inertia."""
+
+from __future__ import annotations
+
+import copy
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+
+LEAST = 1e-8  # kg, kg m^2, below which MuJoCo takes nothing for a moving part
+SOLID = 0.4  # of a ball's inertia over its mass and the square of its radius
+USUAL = 0.05  # m, half of the size of a link whose shape has none
+ENDS = 1e-6  # of the largest moment of inertia, within which rounding lies
+
+
+def complete_links(path: Path, top: ElementTree.Element) -> list[str]:
+    """Give links what simulators ask for and authors leave out; a note for each change.
+
+    Where no link has a shape that touches, and on wheels without one, the visible shape does. A mass of zero is left
+    out, so that the shape gives it. Moments of inertia that no body has become those of a ball, or are balanced.
+    """
+    notes = []
+    turning = {child.get("link") for joint in top.iter("joint") if joint.get("type") == "continuous"
+               and (child := joint.find("child")) is not None}
+    bare = top.find("link/collision") is None
+    for link in top.iter("link"):
+        name, seen = link.get("name", ""), link.findall("visual")
+        if seen and link.find("collision") is None and (bare or name in turning):
+            for visual in seen:
+                shape = copy.deepcopy(visual)
+                shape.tag = "collision"
+                link.append(shape)
+            notes.append(f"{path.name}: link {name} has no collision shape: its visible one touches instead")
+        notes += [f"{path.name}: {one}" for one in _inertial(link, name)]
+    options = top.find("mujoco")
+    options = ElementTree.SubElement(top, "mujoco") if options is None else options
+    compiler = options.find("compiler")
+    compiler = ElementTree.SubElement(options, "compiler") if compiler is None else compiler
+    compiler.set("balanceinertia", "true")
+    return notes
+
+
+def _inertial(link: ElementTree.Element, name: str) -> list[str]:
+    """Mend the mass and the inertia of a link; sentences on what was changed."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return []
+    weight, numbers = inertial.find("mass"), inertial.find("inertia")
+    mass = 0.0 if weight is None else _number(weight, "value")
+    if mass < LEAST:
+        if link.find("collision") is None and link.find("visual") is None:
+            return []
+        link.remove(inertial)
+        return [f"link {name} has a mass of 0: its shape at the density of water gives it"]
+    if numbers is None:
+        return []
+    xx, xy, xz, yy, yz, zz = (_number(numbers, one) for one in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if moments[0] < LEAST * LEAST:
+        ball = SOLID * mass * _reach(link) ** 2
+        for one, value in (("ixx", ball), ("iyy", ball), ("izz", ball), ("ixy", 0.0), ("ixz", 0.0), ("iyz", 0.0)):
+            numbers.set(one, repr(value))
+        return [f"link {name} has a moment of inertia of 0 or less: that of a ball of its size stands in"]
+    if moments[0] + moments[1] < (1 - ENDS) * moments[2]:
+        return [f"link {name} has moments of inertia that no body has ({', '.join(f'{one:.3g}' for one in moments)} "
+                "kg m^2; two together are at least the third): their mean stands in"]
+    return []
+
+
+def _reach(link: ElementTree.Element) -> float:
+    """Half of the largest size of a link's shapes [m]."""
+    sizes = [USUAL]
+    for shape in link.iter("geometry"):
+        for one in shape:
+            stated = [float(part) for part in one.get("size", "").split()]
+            sizes += [max(stated) / 2] if stated else []
+            sizes += [_number(one, "radius")] if one.get("radius") else []
+    return sizes[-1]
+
+
+def _number(element: ElementTree.Element, name: str) -> float:
+    try:
+        return float(element.get(name, 0.0))
+    except ValueError:
+        return 0.0
