@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from dreamer import behavior, optim, parallel, rssm, sensors, spaces, world_model
+from dreamer import distributions as dist
 from dreamer.behavior import ReturnNorm
 from dreamer.config import DreamerConfig
 from dreamer.replay import Batch
@@ -70,12 +71,6 @@ def init_agent(config: DreamerConfig, obs_shape: ObsShape, action_dim: ActionSpe
     return AgentState(params, slow_value, optim.init(params), ReturnNorm(zero, jnp.copy(zero)), average)
 
 
-SURPRISE = "surprise"
-"""Name of the carry (N, 1) that holds a running mean of `rssm.surprise`, where it is asked for [nat]."""
-SURPRISE_RATE = 0.2
-"""Weight of the newest frame in it: half a second at 10 Hz."""
-
-
 def init_carry(config: DreamerConfig, batch: int, action_dim: ActionSpec) -> Carry:
     """Recurrent state of `batch` instances: all zeros mean the start of an episode."""
     latent = rssm.initial(config, batch)
@@ -127,10 +122,6 @@ def act(
         if choice.greedy is not None:
             action = jnp.where(choice.greedy[:, None], actions.mode(config, raw), action)
     after = {"deter": latent.deter, "stoch": latent.stoch, "action": action}
-    if SURPRISE in carry:
-        fresh = rssm.surprise(config, params["dyn"], latent.deter, tokens)
-        mean = carry[SURPRISE] + SURPRISE_RATE * (fresh[:, None] - carry[SURPRISE])
-        after[SURPRISE] = jnp.where(is_first[:, None], fresh[:, None], mean)
     return after, action
 
 
@@ -151,6 +142,12 @@ def policy_step(config: DreamerConfig, params: Params, carry: Carry, obs: Any) -
     obs = jax.tree.map(lambda x: x[None], obs)
     new_carry, action = act(config, params, batched, obs, jnp.zeros((1,), bool), Choice())
     return {name: value[0] for name, value in new_carry.items()}, action[0]
+
+
+def told(params: Params, carry: Carry) -> jax.Array:
+    """Vectors (..., D) of `decode_only`, as they are predicted from the carry of one instance or of several."""
+    features = jnp.concatenate([carry["deter"], carry["stoch"]], -1)
+    return dist.symexp(sensors.decode_vector(params["dec"], features))
 
 
 def policy_carry(config: DreamerConfig, action_dim: ActionSpec) -> Carry:

@@ -74,7 +74,7 @@ class PolicyContract:
     action_repeat: int = 1
     """The policy is evaluated on every k-th tick; its command is held in between."""
     novelty: tuple[float, float] | None = None
-    """Surprise [nat] from which the vehicle slows down, and at which it stops; needs a carry "surprise"."""
+    """Surprise [m] from which the vehicle slows down, and at which it stops; needs a carry "surprise"."""
     camera: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Camera of the training, as plain JSON: pose and field of view, and the frame in which the pose is given."""
 

@@ -15,7 +15,7 @@ from flax import struct
 from dreamer import distributions as dist
 from dreamer import nets
 from dreamer.config import DreamerConfig
-from dreamer.recurrence import scan_products
+from dreamer.recurrence import keep, scan_products
 from dreamer.types import Params
 
 
@@ -106,12 +106,6 @@ def posterior_probs(config: DreamerConfig, params: Params, deter: jax.Array, tok
     """Probabilities (B, S, C) of the latent after seeing the image, from deter (B, D) and tokens (B, E)."""
     hidden = nets.layer(params["post"], jnp.concatenate([deter, tokens], -1))
     return dist.unimix_probs(to_logits(config, nets.linear(params["post_logit"], hidden)), config.unimix)
-
-
-def surprise(config: DreamerConfig, params: Params, deter: jax.Array, tokens: jax.Array) -> jax.Array:
-    """(B,) how much images change what was expected of them: KL(posterior || prior) [nat], from deter and tokens."""
-    posterior = posterior_probs(config, params, deter, tokens)
-    return dist.categorical_kl(posterior, prior_probs(config, params, deter))
 
 
 def observe_step(
@@ -227,13 +221,13 @@ def _observe_body(
     h = config.hidden
     deter, stoch, deter_product = (jnp.where(inputs["is_first"], jnp.zeros_like(x), x) for x in carry)
     from_deter = nets.norm_act(deter_product + terms["in_deter_bias"], terms["in_deter_scale"])
-    from_stoch = nets.norm_act(stoch @ weights["in_stoch"] + terms["in_stoch"], terms["in_stoch_scale"])
+    from_stoch = nets.norm_act(keep(stoch @ weights["in_stoch"] + terms["in_stoch"]), terms["in_stoch_scale"])
     operand = _core_operand(config, deter, jnp.concatenate([from_deter, from_stoch], -1))
-    wide = nets.block_product(operand, weights["core"]) + terms["core"]
+    wide = keep(nets.block_product(operand, weights["core"]) + terms["core"])
     wide = _blocks(config, nets.norm_act(wide.reshape(deter.shape), terms["core_scale"]))
-    gates = nets.block_product(wide, weights["gates"]) + terms["gates"]
+    gates = keep(nets.block_product(wide, weights["gates"]) + terms["gates"])
     deter = gru(config, deter, gates)
-    products = deter @ weights["deter"] + terms["deter"]
+    products = keep(deter @ weights["deter"] + terms["deter"])
     hidden = nets.norm_act(products[:, h:], terms["post_scale"])
     logits = hidden @ weights["post_logit"] + terms["post_logit"]
     probs = dist.unimix_probs(to_logits(config, logits), config.unimix)

@@ -284,7 +284,7 @@ def _parse_novelty(fields: Fields, carry: tuple[Tensor, ...]) -> tuple[float, fl
     slow, stop = fields.rule(
         "novelty", lambda value: (known and isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
                                   and 0 < value[0] < value[1]),
-        f"must be two rising numbers above 0 [nat], beside a carry '{SURPRISE}'")
+        f"must be two rising numbers above 0, beside a carry '{SURPRISE}'")
     return float(slow), float(stop)
 
 

@@ -134,10 +134,10 @@ class Policy:
 
     @property
     def novelty(self) -> float:
-        """How little what was seen lately agrees with what the policy expected [nat]; NaN where its file has no score.
+        """How far what the policy lately believed contradicts itself [m]; NaN where its file has no score.
 
-        It is the carry "surprise": a running mean of the divergence between the world model's state before and after
-        each image.
+        It is the carry "surprise": a running mean of how far the goal that it believes in jumps. In older files it is
+        a divergence [nat].
         """
         for spec, value in zip(self.contract.carry, self._carry, strict=True):
             if spec.name == SURPRISE:

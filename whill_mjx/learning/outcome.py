@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from dreamer.export import PolicyContract, SensingPolicy, export_policy, export_sensing
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import episode_keys
-from whill_mjx.evaluation.novelty import largest_surprise, limits
+from whill_mjx.evaluation.novelty import SURPRISE, largest_surprise, limits
 from whill_mjx.evaluation.policy_file import camera_contract
 from whill_mjx.io.formats import stamp
 from whill_mjx.io.heartbeat import say
@@ -76,7 +76,7 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
     )
     policy, carry = policy_of(options, preset, course)
     weights = jax.tree.map(jnp.asarray, result.params)
-    if "surprise" in carry:
+    if SURPRISE in carry:
         keys = episode_keys(NOVELTY_SEED + options.seed, NOVELTY_EPISODES)
         largest, _ = largest_surprise(course.env, course.params, policy, weights, carry, keys)
         contract = dataclasses.replace(contract, novelty=limits(largest))

@@ -21,6 +21,7 @@ from dreamer.types import FunctionalEnv, Mirror, Transition
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import POSE_METRICS, Env, State, make_env
 from whill_mjx.evaluation.drivers import Driver
+from whill_mjx.evaluation.novelty import watched
 from whill_mjx.learning import ppo
 from whill_mjx.learning.ppo import PpoConfig
 from whill_mjx.learning.shaping import Safety, Step, limit_action, limited_policy, penalty
@@ -401,14 +402,13 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
 
 def dreamer_policy(preset: Preset, control_dt: float) -> tuple[Step, dict[str, Any]]:
     """The agent as the step of one instance, limits included, and its first carry."""
-    learner = preset.learner
+    learner, seconds = preset.learner, control_dt * preset.task.action_repeat
+    step: Step = lambda params, carry, image: agents.policy_step(learner, params, carry, image)  # noqa: E731
     carry = agents.policy_carry(learner, 2)
-    if preset.looks == "rich":
-        carry[agents.SURPRISE] = jnp.zeros(1)
-    return limited_policy(
-        preset.task, preset.safety, lambda params, carry, image: agents.policy_step(learner, params, carry, image),
-        carry, control_dt * preset.task.action_repeat,
-    )  # fmt: skip
+    if preset.looks == "rich" and TRUTH in learner.decode_only:
+        believe = lambda params, carry: privileged.UNIT * agents.told(params, carry)[:4]  # noqa: E731
+        step, carry = watched(step, carry, seconds, believe)
+    return limited_policy(preset.task, preset.safety, step, carry, seconds)
 
 
 def ppo_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:

@@ -1,0 +1,61 @@
+"""Surprise: beliefs that contradict one another raise it, and those of a vehicle that drives do not."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from whill_mjx.evaluation.novelty import BELIEVED, RATE, SURPRISE, contradiction, limits, watched
+
+pytestmark = pytest.mark.quick
+SECONDS = 0.1
+
+
+def beliefs(pose, goal=(4.0, 1.0), v=0.5, omega=0.8):
+    """What a vehicle at a pose that sees well believes of a goal in the room."""
+    x, y, yaw = pose
+    dx, dy = goal[0] - x, goal[1] - y
+    ahead, aside = dx * np.cos(yaw) + dy * np.sin(yaw), dy * np.cos(yaw) - dx * np.sin(yaw)
+    return jnp.array([ahead, aside, v, omega])
+
+
+def drive(steps, v=0.5, omega=0.8):
+    poses = [(0.0, 0.0, 0.3)]
+    for _ in range(steps):
+        x, y, yaw = poses[-1]
+        poses.append((x + v * SECONDS * np.cos(yaw), y + v * SECONDS * np.sin(yaw), yaw + omega * SECONDS))
+    return poses
+
+
+def test_true_beliefs_of_a_vehicle_that_turns_do_not_contradict_one_another():
+    poses = drive(8)
+    for one, other in zip(poses[:-1], poses[1:], strict=True):
+        assert contradiction(beliefs(one), beliefs(other), SECONDS) < 1e-5
+    jumped = beliefs(poses[1]) + jnp.array([0.3, -0.4, 0.0, 0.0])
+    assert contradiction(beliefs(poses[0]), jumped, SECONDS) == pytest.approx(0.5, abs=1e-5)
+
+
+def test_a_watched_policy_acts_as_before_and_carries_the_mean_jump():
+    seen = [beliefs(pose) for pose in drive(6)]
+    seen[3] = seen[3] + jnp.array([0.0, 1.0, 0.0, 0.0])
+
+    def step(weights, carry, image):
+        return {"count": carry["count"] + 1}, weights * image
+
+    act, carry = watched(step, {"count": jnp.zeros(())}, SECONDS, lambda weights, carry: seen[int(carry["count"]) - 1])
+    assert carry[SURPRISE] == 0 and not carry[BELIEVED].any()
+    surprise = []
+    for _ in seen:
+        carry, action = act(2.0, carry, 3.0)
+        surprise.append(float(carry[SURPRISE][0]))
+        assert action == 6.0
+    np.testing.assert_allclose(surprise[:3], 0.0, atol=1e-5)  # the first frame contradicts nothing
+    jump, back = RATE * 1.0, RATE * (1.0 - RATE) + RATE
+    np.testing.assert_allclose(surprise[3:5], [jump, back], atol=1e-5)
+    assert surprise[5] < surprise[4]
+
+
+def test_limits_are_those_of_ordinary_episodes_and_rise():
+    slow, stop = limits(np.linspace(0.0, 1.0, 101))
+    assert (slow, stop) == pytest.approx((0.9, 0.99))
+    slow, stop = limits(np.full(5, 0.2))
+    assert 0 < slow < stop
