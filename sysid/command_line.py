@@ -6,9 +6,22 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from sysid.replay.model_files import steps_mjx
 from sysid.search.result import Progress
 from whill_mjx.io import command_line
 from whill_mjx.io.heartbeat import Heartbeat
+
+
+class OwnModels:
+    """Options of a command that may step a user's robot."""
+
+    model: str
+
+    @property
+    def shares_results(self) -> bool:
+        """Whether XLA may share results: it may abort then on a user's robot."""
+        return not steps_mjx(self.model)
+
 
 _heartbeats: list[Heartbeat] = []
 """That of the command which runs in this process; none where the package is used from Python."""

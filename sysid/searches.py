@@ -42,7 +42,7 @@ OUTPUTS = ("searches.json", "searches.png", "searches.html")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments(FitConfig):
+class Arguments(command_line.OwnModels, FitConfig):
     """Command line of `python -m sysid.searches`; what is fitted is set as for `sysid.fit`."""
 
     dataset: Path

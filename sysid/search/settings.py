@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from sysid.errors.prior import SPREAD
-from sysid.replay.model_files import steps_mjx
 from sysid.search.studies import BATCH
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
@@ -71,8 +70,3 @@ class FitConfig:
     """Another model in place of the simulator's vehicle: an MJCF or URDF file, or FILE.py[:NAME] (docs/fit.md)."""
     wheels: tuple[str, ...] = ()
     """With an MJCF or URDF file: joints or actuators of the driven wheels, left and right."""
-
-    @property
-    def shares_results(self) -> bool:
-        """Whether XLA may share results: it may abort then on a user's robot."""
-        return not steps_mjx(self.model)
