@@ -106,7 +106,7 @@ def days(settings: Benchmark, name: str, trials: set[str] | None = None) -> None
 def planted(settings: Benchmark) -> None:
     """Planted truth of the same model: held-out error against the sensor noise, and starts that agree."""
     from sysid.errors.space import make_space
-    from sysid.logs.synthetic import write_dataset
+    from sysid.logs.synthetic import Schedule, write_dataset
     from whill_mjx.vehicle.parameters import get_values, set_values
     from whill_mjx.vehicle.presets import preset_params
     from whill_mjx.vehicle.specs import WHILL_CR
@@ -116,7 +116,8 @@ def planted(settings: Benchmark) -> None:
     # What the fit takes as known (such as the height of the centre of mass) is as it takes it.
     truth = set_values(start, space.names, get_values(preset_params(WHILL_CR, "paper_optimised"), space.names))
     with tempfile.TemporaryDirectory() as folder:
-        log = load_log(write_dataset(Path(folder) / "log", WHILL_CR, truth, replicates=2, plant=fitted_plant(WHILL_CR)))
+        log = load_log(write_dataset(Path(folder) / "log", WHILL_CR, truth, Schedule(replicates=2),
+                                     plant=fitted_plant(WHILL_CR)))
     fit = fit_log(log, FitConfig(preset="paper", iterations=settings.iterations))
     one = evaluate(fit, log.held_out)["summary"]["held_out"]["ground_truth"]["trajectory"]
     inside = [estimate.low <= value <= estimate.high for estimate, value in zip(
@@ -298,12 +299,12 @@ def searches(settings: Benchmark) -> None:
     problem = make_problem(log, FitConfig())
     judge = Judge(problem, log)
     compile_once(settings.work / "compiled", log.name, lambda: fit_searches.compile_replay(problem.objective))
+    effort = fit_searches.Effort(settings.tpe_trials, settings.iterations, settings.search_starts)
     labels = [f"{method}_{seed:02d}" for seed in range(settings.search_seeds) for method in settings.methods]
 
     def job(label: str) -> dict[str, Any]:
         method, _, seed = label.partition("_")
-        return fit_searches.curve_job(problem, judge, log.spec.track, method, int(seed), settings.tpe_trials,
-                                      settings.iterations, settings.search_starts)
+        return fit_searches.curve_job(problem, judge, method, int(seed), effort)
 
     run_jobs(folder / "jobs", labels_of(settings.part, labels), job)
 

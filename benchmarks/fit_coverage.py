@@ -28,7 +28,7 @@ from sysid.intervals.independence import Evidence
 from sysid.intervals.uncertainty import Estimate, estimate, uncertainty_of
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.replay.models import with_effects
 from sysid.search.fitting import choose, fit_log, fitted_plant, make_problem
 from sysid.search.settings import FitConfig
@@ -71,8 +71,9 @@ def synthetic_log(folder: Path, seed: int) -> tuple[Log, dict[str, float]]:
     space = make_space(start, WHILL_CR, searched(start))
     values = draw_truth(space, np.random.default_rng([seed, 90]))
     truth = set_values(start, space.names, jnp.asarray(values))
-    path = write_dataset(folder / "log", WHILL_CR, truth, manoeuvres=MANOEUVRES, held_out=(), replicates=REPLICATES,
-                         seed=seed, plant=fitted_plant(WHILL_CR))
+    path = write_dataset(folder / "log", WHILL_CR, truth,
+                         Schedule(manoeuvres=MANOEUVRES, held_out=(), replicates=REPLICATES, seed=seed),
+                         plant=fitted_plant(WHILL_CR))
     return load_log(path), dict(zip(space.names, np.asarray(get_values(truth, space.names), float).tolist(),
                                     strict=True))
 

@@ -21,7 +21,7 @@ from sysid.errors.pose_objective import HUGE, Objective
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
 from sysid.search import least_squares, starts, tpe
-from sysid.search.comparison import Judge, arrivals, trace
+from sysid.search.comparison import Effort, Judge, arrivals, trace
 from sysid.search.fitting import Problem, choose, fitted_plant
 from sysid.search.result import Stages, Trace
 from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
@@ -139,7 +139,7 @@ def tpe_batched(problem: Problem, evaluations: int, seed: int, kept: Path) -> di
     objective, space = problem.objective, problem.space
     objective.paper_cost(np.tile(space.to_unit(space.initial), (BATCH["tpe"], 1)))
     costs: Any = RememberedCosts(objective, kept)
-    found = tpe.fit(costs, space, evaluations=evaluations, seed=seed, cost="paper", progress=reporter(kept.stem))
+    found = tpe.fit(costs, space, tpe.GlobalSearch(evaluations, seed, "paper"), progress=reporter(kept.stem))
     return {"cost": found.cost, "seconds": costs.seconds}
 
 
@@ -228,13 +228,9 @@ def summarise_many(results: Sequence[Mapping[str, Any]], platform: str) -> dict[
     return figures
 
 
-def curve_job(
-    problem: Problem, judge: Judge, track: float, method: str, seed: int, evaluations: int, iterations: int,
-    start_count: int,
-) -> dict[str, Any]:
+def curve_job(problem: Problem, judge: Judge, method: str, seed: int, effort: Effort) -> dict[str, Any]:
     """One search of `sysid.searches` and its best point so far."""
-    one = trace(problem, judge, track, method, seed, evaluations=evaluations, iterations=iterations,
-                start_count=start_count, progress=reporter(f"{method}_{seed:02d}"))
+    one = trace(problem, judge, method, seed, effort, reporter(f"{method}_{seed:02d}"))
     return {"trace": {name: value.tolist() if isinstance(value, np.ndarray) else value
                       for name, value in asdict(one).items()}, "names": list(problem.space.names)}
 

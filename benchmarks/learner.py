@@ -46,8 +46,8 @@ def parts(config: DreamerConfig) -> dict[str, Callable[[], Any]]:
 
     def observe(params: Any, tokens: jax.Array) -> jax.Array:
         uniform = jax.random.uniform(key, (*steps, config.stoch))
-        args = (batch.start, batch.prev_action, tokens, batch.is_first, uniform)
-        states, post = rssm.observe(config, params["dyn"], *args)
+        sequences = rssm.Sequences(batch.prev_action, tokens, batch.is_first, uniform)
+        states, post = rssm.observe(config, params["dyn"], batch.start, sequences)
         prior = rssm.prior_probs(config, params["dyn"], states.deter)
         features = states.features().astype(jnp.float32)
         return jnp.mean(jnp.square(features)) + jnp.mean(distributions.categorical_kl(post, prior))

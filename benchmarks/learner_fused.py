@@ -55,60 +55,63 @@ class Layout:
     """One program does all tiles, which needs no waiting: for interpretation on a CPU."""
 
 
-def fused_scan(
-    layout: Layout, step: Step, unroll: int, weights: dict[str, jax.Array], carry: Tree, terms: dict[str, jax.Array],
-    inputs: Tree,
-) -> tuple[Tree, Tree]:
-    """What `recurrence.scan_products` gives for the step of `rssm.observe`, by one kernel; not differentiable.
-
-    Raises:
-        ValueError: a width is not a power of two, which Triton needs.
-    """
-    config: DreamerConfig = step.args[0]  # type: ignore[attr-defined]
+def _check_widths(config: DreamerConfig) -> None:
+    """Raise ValueError for a width that is not a power of two, which Triton needs."""
     for name in ("deter", "hidden", "stoch", "classes", "blocks", "batch_size"):
         value = getattr(config, name)
         if value & (value - 1):
             raise ValueError(f"fused posterior: {name} is {value}; Triton needs a power of two.")
-    deter, stoch, product = carry
-    (count, batch), width, hidden, latent = inputs["is_first"].shape[:2], config.deter, config.hidden, stoch.shape[-1]
-    dtype = deter.dtype
-    tiles = width // layout.columns
-    programs = 1 if layout.alone else tiles
-    constants = {name: terms[name][0, 0].reshape(-1) for name in terms if name not in ("core", "deter")}
-    read = {**{f"{name}_weight": value for name, value in weights.items()},
-            **{f"{name}_constant": value for name, value in constants.items()},
-            "core_term": terms["core"].reshape(count, batch, width), "post_term": terms["deter"][..., hidden:],
-            "first": inputs["is_first"][..., 0].astype(jnp.int32), "uniform": inputs["uniform"]}
-    begun = {
-        "deter": jnp.zeros((count + 1, batch, width), dtype).at[0].set(deter),
-        "stoch": jnp.zeros((count + 1, batch, latent), dtype).at[0].set(stoch),
-        "products": jnp.zeros((PARTS, batch, 2 * hidden), jnp.float32).at[0, :, :hidden].set(product),
-        "waiting": jnp.zeros((1,), jnp.int32),
-    }  # fmt: skip
-    made = {
-        "from_stoch": ((batch, hidden), jnp.float32), "wide": ((batch, width), jnp.float32),
-        "squares": ((tiles, batch), jnp.float32), "probs": ((count, batch, latent), jnp.float32),
-    }  # fmt: skip
-    names, shared, fresh = list(read), list(begun), list(made)
 
-    def kernel(*refs: Any) -> None:
-        own = dict(zip([*names, *[f"{name}_before" for name in shared], *shared, *fresh], refs, strict=True))
-        _Program(config, layout, own, batch, pl.program_id(0)).run(count)
 
-    call = pl.pallas_call(
-        kernel,
-        out_shape=[*(jax.ShapeDtypeStruct(begun[name].shape, begun[name].dtype) for name in shared),
-                   *(jax.ShapeDtypeStruct(*made[name]) for name in fresh)],
-        grid=(programs,),
-        input_output_aliases={len(names) + i: i for i in range(len(shared))},
-        compiler_params=plt.CompilerParams(num_warps=layout.warps, num_stages=1),
-        interpret=layout.alone,
-        name="fused_posterior",
-    )  # fmt: skip
-    out = dict(zip([*shared, *fresh], call(*read.values(), *begun.values()), strict=True))
-    last = (out["deter"][-1], out["stoch"][-1], out["products"][..., :hidden].sum(0).astype(dtype))
-    probs = out["probs"].reshape(count, batch, config.stoch, config.classes)
-    return last, (out["deter"][1:], out["stoch"][1:], probs)
+def fused_scan(layout: Layout) -> Callable[..., tuple[Tree, Tree]]:
+    """`recurrence.scan_products` for the step of `rssm.observe`, by one kernel; not differentiable."""
+    def scan(step: Step, unroll: int, weights: dict[str, jax.Array], carry: Tree, terms: dict[str, jax.Array],
+             inputs: Tree) -> tuple[Tree, Tree]:
+        config: DreamerConfig = step.args[0]  # type: ignore[attr-defined]
+        _check_widths(config)
+        deter, stoch, product = carry
+        (count, batch), width, hidden = inputs["is_first"].shape[:2], config.deter, config.hidden
+        latent = stoch.shape[-1]
+        dtype = deter.dtype
+        tiles = width // layout.columns
+        programs = 1 if layout.alone else tiles
+        constants = {name: terms[name][0, 0].reshape(-1) for name in terms if name not in ("core", "deter")}
+        read = {**{f"{name}_weight": value for name, value in weights.items()},
+                **{f"{name}_constant": value for name, value in constants.items()},
+                "core_term": terms["core"].reshape(count, batch, width), "post_term": terms["deter"][..., hidden:],
+                "first": inputs["is_first"][..., 0].astype(jnp.int32), "uniform": inputs["uniform"]}
+        begun = {
+            "deter": jnp.zeros((count + 1, batch, width), dtype).at[0].set(deter),
+            "stoch": jnp.zeros((count + 1, batch, latent), dtype).at[0].set(stoch),
+            "products": jnp.zeros((PARTS, batch, 2 * hidden), jnp.float32).at[0, :, :hidden].set(product),
+            "waiting": jnp.zeros((1,), jnp.int32),
+        }  # fmt: skip
+        made = {
+            "from_stoch": ((batch, hidden), jnp.float32), "wide": ((batch, width), jnp.float32),
+            "squares": ((tiles, batch), jnp.float32), "probs": ((count, batch, latent), jnp.float32),
+        }  # fmt: skip
+        names, shared, fresh = list(read), list(begun), list(made)
+
+        def kernel(*refs: Any) -> None:
+            own = dict(zip([*names, *[f"{name}_before" for name in shared], *shared, *fresh], refs, strict=True))
+            _Program(config, layout, own, batch, pl.program_id(0)).run(count)
+
+        call = pl.pallas_call(
+            kernel,
+            out_shape=[*(jax.ShapeDtypeStruct(begun[name].shape, begun[name].dtype) for name in shared),
+                       *(jax.ShapeDtypeStruct(*made[name]) for name in fresh)],
+            grid=(programs,),
+            input_output_aliases={len(names) + i: i for i in range(len(shared))},
+            compiler_params=plt.CompilerParams(num_warps=layout.warps, num_stages=1),
+            interpret=layout.alone,
+            name="fused_posterior",
+        )  # fmt: skip
+        out = dict(zip([*shared, *fresh], call(*read.values(), *begun.values()), strict=True))
+        last = (out["deter"][-1], out["stoch"][-1], out["products"][..., :hidden].sum(0).astype(dtype))
+        probs = out["probs"].reshape(count, batch, config.stoch, config.classes)
+        return last, (out["deter"][1:], out["stoch"][1:], probs)
+
+    return scan
 
 
 @dataclass(frozen=True)
@@ -382,7 +385,7 @@ def _timed(config: DreamerConfig, layout: Layout | None, arguments: tuple[Any, .
     params, start, *rest = arguments
 
     def observe(params: Params, start: Latent, *rest: jax.Array) -> Latent:
-        return rssm.observe(config, params, start, *rest)[0]
+        return rssm.observe(config, params, start, rssm.Sequences(*rest))[0]
 
     def many(params: Params, start: Latent, *rest: jax.Array) -> Latent:
         def one(_: jax.Array, start: Latent) -> Latent:
@@ -392,7 +395,7 @@ def _timed(config: DreamerConfig, layout: Layout | None, arguments: tuple[Any, .
 
     with contextlib.ExitStack() as stack:
         if layout is not None:
-            stack.enter_context(mock.patch.object(rssm, "scan_products", partial(fused_scan, layout)))
+            stack.enter_context(mock.patch.object(rssm, "scan_products", fused_scan(layout)))
         states = jax.jit(observe)(params, start, *rest)
         program = jax.jit(many).lower(params, start, *rest).compile()
     seconds = harness.time_calls(lambda: program(params, start, *rest), repeats=blocks)

@@ -237,13 +237,7 @@ def plain_scan(
 
 
 def plain_observe(
-    config: DreamerConfig,
-    params: Params,
-    start: Latent,
-    actions: jax.Array,
-    tokens: jax.Array,
-    is_first: jax.Array,
-    uniform: jax.Array,
+    config: DreamerConfig, params: Params, start: Latent, sequences: rssm.Sequences
 ) -> tuple[Latent, jax.Array]:
     """`rssm.observe` as it is read, with everything inside the scan; arguments and results as there."""
 
@@ -258,4 +252,4 @@ def plain_observe(
         return Latent(deter, stoch), (Latent(deter, stoch), probs)
 
     scan = partial(jax.lax.scan, unroll=config.scan_unroll)
-    return scan(body, start, (actions, tokens, is_first, uniform))[1]
+    return scan(body, start, tuple(sequences))[1]

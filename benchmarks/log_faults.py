@@ -29,7 +29,7 @@ LAG = 0.15  # s in which a base follows a command to stop
 def bases() -> dict[str, tuple[Drive, ...]]:
     """Drives that nothing is wrong with by robot: those of the shipped chair, and simulated ones."""
     from sysid.logs.log import load_log
-    from sysid.logs.synthetic import write_dataset
+    from sysid.logs.synthetic import Schedule, write_dataset
     from whill_mjx.vehicle.presets import preset_params
     from whill_mjx.vehicle.specs import find_spec
 
@@ -38,8 +38,8 @@ def bases() -> dict[str, tuple[Drive, ...]]:
         for name in SIMULATED:
             spec = find_spec(name)
             params = preset_params(spec, "physical")
-            logs[name] = load_log(write_dataset(Path(folder) / name, spec, params, manoeuvres=MANOEUVRES, held_out=(),
-                                                replicates=1))
+            logs[name] = load_log(write_dataset(Path(folder) / name, spec, params,
+                                                Schedule(manoeuvres=MANOEUVRES, held_out=(), replicates=1)))
     return {name: tuple({
         "command": trial.command.table, "odometry": np.column_stack([trial.odometry.t, trial.odometry.values]),
         "ground_truth": np.column_stack([trial.ground_truth.t, trial.ground_truth.values])}

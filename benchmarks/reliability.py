@@ -1,6 +1,6 @@
 """Measures what docs/reliability.md promises: damaged files, mistaken commands, kills and Ctrl-C.
 
-    python -m benchmarks.reliability --parts files --rooms sysid  # minutes a room; that of the bridge takes an hour
+    python -m benchmarks.reliability --parts files --rooms sysid  # half an hour of one core; bridge: several hours
     python -m benchmarks.reliability --parts options              # minutes
     python -m benchmarks.reliability --parts alone kills --commands fit --kills 10 --seed 1  # 15 minutes on two cores
     python -m benchmarks.reliability --parts ctrl_c               # an hour
@@ -12,7 +12,8 @@ be read. The run left alone is watched: the longest time in which it saves nothi
 Both are processor time, which does not depend on what else the computer does.
 
 What was measured is kept in --keep: a benchmark that is stopped goes on there. Figures are those of all rooms, commands
-and seeds that it holds, each with its commit, so parts may run side by side on machines of one kind.
+and seeds that it holds, each with its commit, so parts may run side by side on machines of one kind. Work divides by
+seed: two times `--parts files --damaged 1000`, with --seed 0 and 1, are 2,000 files for each reader.
 """
 
 from __future__ import annotations
@@ -48,12 +49,12 @@ ROOT = Path(__file__).parents[1]
 PARTS = ("files", "options", "alone", "kills", "ctrl_c")
 CHAIR = "sysid/data/chair"
 COMMANDS = {
-    "fit": ["sysid.fit", CHAIR, "--starts", "8"],
-    "close_loop": ["sysid.close_loop", CHAIR, "--refit-nulls", "20"],
-    "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "100000",
+    "fit": ["sysid.fit", CHAIR, "--starts", "5"],
+    "close_loop": ["sysid.close_loop", CHAIR, "--refit-nulls", "5"],
+    "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "60000",
               "--episodes", "2", "--no-planner", "--videos", "0", "--checkpoint-every-s", "20"],
 }  # fmt: skip
-"""Runs of five to eight minutes on two cores."""
+"""Runs of five to ten minutes on two cores: one that is killed ten times and then ends takes a quarter of an hour."""
 QUICK = {
     "fit": ["sysid.fit", CHAIR, "--quick"],
     "close_loop": ["sysid.close_loop", CHAIR, "--quick"],
@@ -99,6 +100,10 @@ class Kept:
         found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
         return found if any_commit or found.get("commit") == self._commit else {}
 
+    def all(self, beginning: str) -> list[dict[str, Any]]:
+        """What is known under names that begin so, of any commit."""
+        return [self.read(path.stem, any_commit=True) for path in sorted(self.folder.glob(f"{beginning}*.json"))]
+
     def write(self, name: str, found: dict[str, Any]) -> None:
         """Keep it."""
         write_whole(self.folder / f"{name}.json", json.dumps({**found, "commit": self._commit}, indent=1) + "\n")
@@ -116,31 +121,31 @@ def damaged_room(room: str, count: int, jobs: int) -> dict[str, Any]:
     return {"count": count, "readers": parts[0][0], "failed": failed, "device": device_name()}
 
 
-def damaged_files(rooms: list[str], count: int, jobs: int, kept: Kept) -> Figures:
-    """Try `count` damaged files on each reader of some rooms, where fewer are kept."""
+def damaged_files(rooms: list[str], count: int, jobs: int, seed: int, kept: Kept) -> None:
+    """Try `count` damaged files on each reader of some rooms, where fewer are kept under this seed."""
     for room in rooms:
-        if kept.read(f"files_{room}").get("count", 0) < count:
+        if kept.read(f"files_{room}_{seed}").get("count", 0) < count:
             found = damaged_room(room, count, jobs)
-            kept.write(f"files_{room}", found)
+            kept.write(f"files_{room}_{seed}", found)
             said = [one[:300] for one in found["failed"]]
             print(f"{room}: {found['readers']} readers, {len(said)} failed {said}", flush=True)
-    return damaged_figures(kept)
 
 
 def damaged_figures(kept: Kept) -> Figures:
-    """Readers that let out another exception, hang or need too much, of all rooms that are kept."""
-    known = {room: found for room in ROOMS if (found := kept.read(f"files_{room}", any_commit=True))}
+    """Readers that let out another exception, hang or need too much, of all rooms and seeds that are kept."""
+    known = {room: found for room in ROOMS if (found := kept.all(f"files_{room}"))}
     if not known:
         return {}
-    failed = [one for found in known.values() for one in found["failed"]]
+    every = [one for found in known.values() for one in found]
+    failed = [message for one in every for message in one["failed"]]
     hangs = [one for one in failed if "SECONDS" in one or "process_time" in one]
     memory = [one for one in failed if "BYTES" in one or "_peak" in one or "MemoryError" in one]
-    about = {"files_per_reader": {room: found["count"] for room, found in known.items()},
-             "commits": {room: found["commit"] for room, found in known.items()},
-             "readers": sum(found["readers"] for found in known.values())}
+    about = {"files_per_reader": {room: sum(one["count"] for one in found) for room, found in known.items()},
+             "commits": {room: " ".join(sorted({one["commit"] for one in found})) for room, found in known.items()},
+             "readers": sum(found[0]["readers"] for found in known.values())}
     counts = {"undocumented": len(failed) - len(hangs) - len(memory), "hangs": len(hangs), "memory": len(memory)}
-    device = next(iter(known.values()))["device"]
-    return {f"fuzz_{name}": {**figure([float(number)], "count", device), **about} for name, number in counts.items()}
+    return {f"fuzz_{name}": {**figure([float(number)], "count", every[0]["device"]), **about}
+            for name, number in counts.items()}
 
 
 def mistaken_commands() -> Figures:
@@ -285,45 +290,62 @@ def kill_again_and_again(name: str, words: list[str], kills: int, seed: int, kep
 
 
 def killed_figures(kept: Kept) -> Figures:
-    """Sums over all kills that ended in bits, of commands that were also left alone."""
+    """Sums over all kills, and over the bits of those runs that came to their end beside one that was left alone.
+
+    What a kill cost is known at once; a run that was not taken to its end has no bits to compare.
+    """
     alone = {name: found for name in COMMANDS if (found := kept.read(f"alone_{name}", any_commit=True))}
-    runs: list[dict[str, Any]] = []
-    for name, left in alone.items():
-        for path in sorted(kept.folder.glob(f"kills_{name}_*.json")):
-            one = kept.read(path.stem, any_commit=True)
-            one["wrong_ends"] = len(one["wrong_ends"])
-            if one["bits"] and one["words"] == left["words"] and one["commit"] == left["commit"]:
-                runs.append({**one, "name": name, "different": sum(bits != left["bits"] for bits in one["bits"])})
-    if not runs:
+    runs = {name: kills for name in COMMANDS if (kills := kept.all(f"kills_{name}_"))}
+    every = [one for found in runs.values() for one in found]
+    if not every:
         return {}
-    about = {"kills": {name: sum(one["kills"] for one in runs if one["name"] == name) for name in alone},
-             "ended": sum(len(one["bits"]) for one in runs), "commits": sorted({one["commit"] for one in runs}),
+    compared = {name: [bits == alone[name]["bits"] for one in found for bits in one["bits"]
+                       if (one["words"], one["commit"]) == (alone[name]["words"], alone[name]["commit"])]
+                for name, found in runs.items() if name in alone}
+    about = {"kills": sum(one["kills"] for one in every),
+             "kills_of": {name: sum(one["kills"] for one in found) for name, found in runs.items()},
+             "ended": sum(len(same) for same in compared.values()),
+             "commits": sorted({one["commit"] for one in every}),
              "seconds": {name: found["seconds"] for name, found in alone.items()}}  # fmt: skip
-    device = next(iter(alone.values()))["device"]
-    counts = {f"kills_{what}": {**figure([float(sum(one[what] for one in runs))], "count", device), **about}
-              for what in ("lost", "different", "half_written", "wrong_ends")}
+    counts = {"lost": sum(one["lost"] for one in every), "half_written": sum(one["half_written"] for one in every),
+              "wrong_ends": sum(len(one["wrong_ends"]) for one in every),
+              "different": sum(not same for found in compared.values() for same in found)}
+    device = next((one["device"] for one in (*alone.values(), *every) if "device" in one), device_name())
+    figures = {f"kills_{what}": {**figure([float(count)], "count", device), **about} for what, count in counts.items()}
+    if not alone:
+        return figures
     unsaved = [found["unsaved_s"] for found in alone.values()]
     longest = figure(unsaved, "s of processor time that a run computed without saving, at most", device)
-    return {**counts, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
+    return {**figures, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
 
 
-def interrupted(commands: dict[str, list[str]], count: int, seed: int) -> Figures:
-    """Seconds from Ctrl-C at random moments to the end of the process, at its 95th percentile over `count` each."""
-    chosen, seconds, wrong = random.Random(seed), [], 0
-    for name, words in commands.items():
-        for _ in range(count):
-            with tempfile.TemporaryDirectory() as folder:
-                child = Started(words, Path(folder) / "run")
-                time.sleep(chosen.uniform(0.5, 40.0))
-                began = time.monotonic()
-                child.send_signal(signal.SIGINT)
-                said = child.said()
-                seconds.append(time.monotonic() - began)
-                wrong += child.returncode != 130 or "Traceback" in said
-                print(f"{name}: {seconds[-1]:.2f} s, exit code {child.returncode}", flush=True)
-    late = figure(seconds, "s")
-    return {"ctrl_c_p95_s": {**late, "value": float(np.quantile(seconds, 0.95))},
-            "ctrl_c_wrong_ends": {**figure([float(wrong)], "count"), "interrupts": len(seconds)}}
+def interrupted(name: str, words: list[str], count: int, seed: int, kept: Kept) -> None:
+    """Keep the seconds from Ctrl-C to the end of the process, `count` times at random moments, and wrong ends."""
+    chosen = random.Random(seed)
+    found: dict[str, Any] = {"seconds": [], "wrong_ends": [], "device": device_name()}
+    for _ in range(count):
+        with tempfile.TemporaryDirectory() as folder:
+            child = Started(words, Path(folder) / "run")
+            time.sleep(chosen.uniform(0.5, 40.0))
+            began = time.monotonic()
+            child.send_signal(signal.SIGINT)
+            said = child.said()
+            found["seconds"].append(time.monotonic() - began)
+            if child.returncode != 130 or "Traceback" in said:
+                found["wrong_ends"].append(f"exit code {child.returncode}: {said[-1000:]}")
+        kept.write(f"ctrl_c_{name}_{seed}", found)
+        print(f"{name}: {found['seconds'][-1]:.2f} s, exit code {child.returncode}", flush=True)
+
+
+def interrupted_figures(kept: Kept) -> Figures:
+    """The 95th percentile over all interrupts of all commands and seeds."""
+    if not (known := kept.all("ctrl_c_")):
+        return {}
+    seconds = [one for found in known for one in found["seconds"]]
+    about = {"interrupts": len(seconds), "commits": sorted({found["commit"] for found in known})}
+    wrong, device = sum(len(found["wrong_ends"]) for found in known), known[0]["device"]
+    return {"ctrl_c_p95_s": {**figure(seconds, "s", device), "value": float(np.quantile(seconds, 0.95)), **about},
+            "ctrl_c_wrong_ends": {**figure([float(wrong)], "count", device), **about}}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -338,7 +360,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--kills", type=whole(0), default=30, help="of each command")
     parser.add_argument("--interrupts", type=whole(), default=20, help="of each command")
     parser.add_argument("--commands", nargs="+", choices=tuple(COMMANDS), default=list(COMMANDS))
-    parser.add_argument("--seed", type=whole(0), default=0, help="of the moments of the kills and of Ctrl-C")
+    parser.add_argument("--seed", type=whole(0), default=0,
+                        help="of the moments of kills and of Ctrl-C; with files, the name of this share of them")
     parser.add_argument("--quick", action="store_true", help="kill runs of a minute instead of five")
     parser.add_argument("--keep", type=Path, default=Path("runs/reliability"), help="folder to go on in")
     parser.add_argument("--runs", type=Path, help="folder of the runs themselves; by default that of --keep")
@@ -348,22 +371,21 @@ def main(arguments: list[str] | None = None) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     kept = Kept(given.keep, given.runs or given.keep)
     commands = {name: (QUICK if given.quick else COMMANDS)[name] for name in given.commands}
-    def alone() -> Figures:
-        for name, words in commands.items():
-            left_alone(name, words, kept)
-        return killed_figures(kept)
-
-    def kills() -> Figures:
-        for name, words in commands.items():
-            kill_again_and_again(name, words, given.kills, given.seed, kept)
-        return killed_figures(kept)
-
-    parts: dict[str, Callable[[], Figures]] = {
-        "files": lambda: damaged_files(given.rooms, given.damaged, given.jobs, kept), "options": mistaken_commands,
-        "alone": alone, "kills": kills, "kept": lambda: {**killed_figures(kept), **damaged_figures(kept)},
-        "ctrl_c": lambda: interrupted(commands, given.interrupts, given.seed)}
+    parts: dict[str, Callable[[str, list[str]], None]] = {
+        "alone": lambda name, words: left_alone(name, words, kept),
+        "kills": lambda name, words: kill_again_and_again(name, words, given.kills, given.seed, kept),
+        "ctrl_c": lambda name, words: interrupted(name, words, given.interrupts, given.seed, kept)}
+    figures: Figures = {}
     for part in given.parts:
-        if figures := parts[part]():
+        if part == "files":
+            damaged_files(given.rooms, given.damaged, given.jobs, given.seed, kept)
+        elif part == "options":
+            figures |= mistaken_commands()
+        elif part in parts:
+            for name, words in commands.items():
+                parts[part](name, words)
+        figures |= {**killed_figures(kept), **damaged_figures(kept), **interrupted_figures(kept)}
+        if figures:
             print(record("reliability", CLAIM, figures, given.out), flush=True)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,16 +78,19 @@ def init_carry(config: DreamerConfig, batch: int, action_dim: ActionSpec) -> Car
     return {"deter": latent.deter, "stoch": latent.stoch, "action": action}
 
 
+class Choice(NamedTuple):
+    """How N instances choose their actions."""
+
+    key: jax.Array | None = None
+    """Consumed; None takes the most probable latent and action, as on the vehicle."""
+    noise: jax.Array | None = None
+    """(N, ...) random numbers that choose the actions (`spaces`); drawn by the key unless given."""
+    greedy: jax.Array | None = None
+    """(N,) bool, those which take the most probable action all the same; none unless given."""
+
+
 def act(
-    config: DreamerConfig,
-    params: Params,
-    carry: Carry,
-    obs: Any,
-    is_first: jax.Array,
-    key: jax.Array | None,
-    mode: bool = False,
-    noise: jax.Array | None = None,
-    greedy: jax.Array | None = None,
+    config: DreamerConfig, params: Params, carry: Carry, obs: Any, is_first: jax.Array, choice: Choice
 ) -> tuple[Carry, jax.Array]:
     """Infer the state of N instances from their frames and choose actions.
 
@@ -97,10 +100,7 @@ def act(
         carry: from `init_carry` or the previous call.
         obs: (N, ...) as the environment shows it.
         is_first: (N,) bool, resets the carry.
-        key: consumed; may be None in mode.
-        mode: take the most probable latent and action, as on the vehicle.
-        noise: (N, ...) random numbers that choose the actions (`spaces`); drawn here unless given.
-        greedy: (N,) bool, those which take the most probable action all the same; none unless given.
+        choice: how actions are chosen.
 
     Returns:
         The carry, whose latent is the state after this frame, and actions (N, A), not clipped; one-hot classes.
@@ -108,20 +108,19 @@ def act(
     keep = {name: jnp.where(is_first[:, None], jnp.zeros_like(value), value) for name, value in carry.items()}
     tokens = sensors.encode(config, params["enc"], obs)
     uniform = None
-    if not mode:
-        assert key is not None
-        latent_key, action_key = jax.random.split(key)
+    if choice.key is not None:
+        latent_key, action_key = jax.random.split(choice.key)
         uniform = jax.random.uniform(latent_key, (tokens.shape[0], config.stoch))
     previous = Latent(keep["deter"], keep["stoch"])
     latent = rssm.observe_step(config, params["dyn"], previous, keep["action"], tokens, uniform)
     actions, raw = spaces.actions_of(params), world_model.head(params["policy"], latent.features())
-    if mode:
+    if choice.key is None:
         action = actions.mode(config, raw)
     else:
-        noise = actions.noise(action_key, raw.shape[:1]) if noise is None else noise
+        noise = actions.noise(action_key, raw.shape[:1]) if choice.noise is None else choice.noise
         action = actions.sample(config, raw, noise)
-        if greedy is not None:
-            action = jnp.where(greedy[:, None], actions.mode(config, raw), action)
+        if choice.greedy is not None:
+            action = jnp.where(choice.greedy[:, None], actions.mode(config, raw), action)
     after = {"deter": latent.deter, "stoch": latent.stoch, "action": action}
     return after, action
 
@@ -141,7 +140,7 @@ def policy_step(config: DreamerConfig, params: Params, carry: Carry, obs: Any) -
     config = dataclasses.replace(config, compute_dtype="float32")
     batched = {name: value[None].astype(jnp.float32) for name, value in carry.items()}
     obs = jax.tree.map(lambda x: x[None], obs)
-    new_carry, action = act(config, params, batched, obs, jnp.zeros((1,), bool), None, mode=True)
+    new_carry, action = act(config, params, batched, obs, jnp.zeros((1,), bool), Choice())
     return {name: value[0] for name, value in new_carry.items()}, action[0]
 
 

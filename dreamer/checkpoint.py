@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,31 +41,33 @@ class CheckpointError(ValueError):
 Rows = tuple[str, int, int]
 
 
-def save(
-    folder: Path,
-    state: Any,
-    config: Any,
-    env_steps: int,
-    wall_s: float = 0.0,
-    rows: Rows | None = None,
-    pretraining: int = 0,
-) -> Path:
+class Moment(NamedTuple):
+    """When in a training a checkpoint is written."""
+
+    env_steps: int
+    """Names the checkpoint."""
+    wall_s: float = 0.0
+    """Time trained so far [s]."""
+    pretraining: int = 0
+    """Steps and updates made so far where no counted step has been; part of the name."""
+
+
+def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | None = None) -> Path:
     """Write a checkpoint and return its path; older ones beyond the last two are removed afterwards.
 
     Args:
         folder: of all checkpoints.
         state: pytree of arrays; typed random keys are allowed.
         config: dataclass with a default for every field; saved beside it and compared on reading.
-        env_steps: names the checkpoint.
-        wall_s: time trained so far [s].
+        moment: of the training.
         rows: (path prefix, used rows, all rows): leaves below the prefix whose first axis has `all rows` are cut to the
             used ones, so that a replay that is not full costs no more than it holds.
-        pretraining: steps and updates made so far where no counted step has been; part of the name.
     """
     import orbax.checkpoint as ocp
 
     folder.mkdir(parents=True, exist_ok=True)
     _remove_unfinished(folder)
+    env_steps, wall_s, pretraining = moment
     target = folder / (f"{env_steps:012d}.{pretraining:012d}" if pretraining else f"{env_steps:012d}")
     arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
     if not parallel.is_first_process():

@@ -21,11 +21,11 @@ def evaluate(
     params: Params,
     key: jax.Array,
     episodes: int,
-    mode: bool = True,
     max_steps: int = 100_000,
 ) -> dict[str, np.ndarray]:
     """Results of `episodes` episodes.
 
+    The agent acts deterministically, as on the vehicle.
     Each instance plays one episode per round and is then ignored, so that short episodes do not count more often.
 
     Args:
@@ -34,7 +34,6 @@ def evaluate(
         params: of the agent, or of several with a seed axis in front.
         key: consumed; all seeds meet the same starts.
         episodes: how many; rounds of `env.num_envs`, the last one cut to its first instances.
-        mode: act deterministically, as on the vehicle.
         max_steps: a round ends here even if an instance has not finished.
 
     Returns:
@@ -46,25 +45,25 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes = {episodes}: it must be at least 1. Pass a positive number.")
-    play = _compiled(env, config, mode, max_steps, bool(seeds.count(params)))
+    play = _compiled(env, config, max_steps, bool(seeds.count(params)))
     keys = jax.random.split(key, -(-episodes // env.num_envs))
     rounds = [jax.device_get(play(params, round_key)) for round_key in keys]
     return {name: np.concatenate([result[name] for result in rounds], -1)[..., :episodes] for name in rounds[0]}
 
 
 @lru_cache(maxsize=8)
-def _compiled(env: FunctionalEnv, config: DreamerConfig, mode: bool, max_steps: int, several: bool) -> Any:
+def _compiled(env: FunctionalEnv, config: DreamerConfig, max_steps: int, several: bool) -> Any:
     def play(params: Params, key: jax.Array) -> dict[str, jax.Array]:
-        return play_round(env, config, params, key, mode, max_steps)
+        return play_round(env, config, params, key, max_steps)
 
     return jax.jit(jax.vmap(play, in_axes=(0, None)) if several else play)
 
 
 def play_round(
-    env: FunctionalEnv, config: DreamerConfig, params: Params, key: jax.Array, mode: bool, max_steps: int
+    env: FunctionalEnv, config: DreamerConfig, params: Params, key: jax.Array, max_steps: int
 ) -> dict[str, jax.Array]:
     """The first episode of every instance: arrays (N,) as in `evaluate`."""
-    reset_key, run_key = jax.random.split(key)
+    reset_key, _ = jax.random.split(key)
     env_state, transition = env.reset(reset_key)
     zeros = jnp.zeros((env.num_envs,), jnp.float32)
     start = {
@@ -80,8 +79,7 @@ def play_round(
 
     def advance(loop: tuple) -> tuple:
         step, env_state, transition, carry, result = loop
-        step_key = jax.random.fold_in(run_key, step)
-        carry, action = agents.act(config, params, carry, transition.obs, transition.is_first, step_key, mode)
+        carry, action = agents.act(config, params, carry, transition.obs, transition.is_first, agents.Choice())
         env_state, transition = env.step(env_state, actions.to_env(action))
         active = ~result["finished"]
         ends = active & transition.is_last

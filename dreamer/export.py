@@ -32,6 +32,7 @@ from dreamer.spaces import ActionSpec, Discrete, ObsShape
 from dreamer.types import Params
 
 SINGLE = AgentContract.SINGLE
+CHECK_STEPS = 200  # recurrent steps on random observations over which ONNX and JAX are compared
 """Name of an observation that the environment does not name."""
 
 Step = Callable[[Carry, jax.Array], tuple[Carry, jax.Array]]
@@ -100,7 +101,7 @@ def export_policy(
     *,
     vehicle_file: str | Path | None = None,
     stablehlo: bool = False,
-    check_steps: int = 200,
+    check_steps: int = CHECK_STEPS,
 ) -> Path:
     """Write a policy file and return its folder.
 
@@ -152,7 +153,6 @@ def export_agent(
     action_dim: ActionSpec,
     *,
     task: str = "",
-    check_steps: int = 200,
 ) -> Path:
     """Write the policy of an agent as ONNX, whatever it sees and does, and return its folder.
 
@@ -167,7 +167,6 @@ def export_agent(
         obs_shape: as the environment declares it.
         action_dim: as the environment declares it.
         task: name of the task, for the reader.
-        check_steps: recurrent steps on random observations over which ONNX and JAX are compared.
 
     Raises:
         ValueError: parameters, observations and actions do not fit, two tensors have one name, or the ONNX network acts
@@ -179,7 +178,7 @@ def export_agent(
         raise ValueError(f"params: the policy's last bias has the shape {bias.shape}, but {actions} needs "
                          f"({actions.outputs},). Give the action_dim of the training, and of several seeds one agent "
                          "(dreamer.seeds.pick).")
-    converted = Converted.of(_network_of(config, params, obs_shape, actions), check_steps)
+    converted = Converted.of(_network_of(config, params, obs_shape, actions), CHECK_STEPS)
     described = {name: list(one) for name, one in obs_shape.items()} if isinstance(obs_shape, Mapping) else obs_shape
     table = {
         "schema": SCHEMA,
@@ -191,16 +190,22 @@ def export_agent(
     return _write_agent(path, converted, params, table)
 
 
+@dataclasses.dataclass(frozen=True)
+class SensingPolicy:
+    """A policy of one instance that observes other sensors than a camera alone."""
+
+    step: Callable[[Carry, dict[str, jax.Array]], tuple[Carry, jax.Array]]
+    """Pure function, (carry, observations by name) -> (carry, action (2,) in [-1, 1])."""
+    carry: Mapping[str, jax.Array | np.ndarray]
+    """Recurrent state by name; may be empty."""
+    obs_shape: Mapping[str, tuple[int, ...]]
+    """Shapes by name, (H, W, C) of uint8 or (D,) of float32."""
+    weights: Any
+    """Pytree of the parameters."""
+
+
 def export_sensing(
-    path: str | Path,
-    step: Callable[[Carry, dict[str, jax.Array]], tuple[Carry, jax.Array]],
-    carry: Mapping[str, jax.Array | np.ndarray],
-    obs_shape: Mapping[str, tuple[int, ...]],
-    weights: Any,
-    contract: PolicyContract,
-    *,
-    vehicle_file: str | Path | None = None,
-    check_steps: int = 200,
+    path: str | Path, policy: SensingPolicy, contract: PolicyContract, vehicle_file: str | Path | None = None
 ) -> Path:
     """Write the policy of a vehicle that observes other sensors than its camera alone, and return its folder.
 
@@ -209,26 +214,22 @@ def export_sensing(
 
     Args:
         path: folder to write; an existing policy file there is replaced as a whole.
-        step: pure function of one instance, (carry, observations by name) -> (carry, action (2,) in [-1, 1]).
-        carry: recurrent state by name; may be empty.
-        obs_shape: shapes by name, (H, W, C) of uint8 or (D,) of float32.
-        weights: pytree of the parameters.
+        policy: what is exported.
         contract: action, rate and task; its image and camera are not written.
         vehicle_file: TOML vehicle file to put beside the policy.
-        check_steps: recurrent steps on random observations over which ONNX and JAX are compared.
 
     Raises:
         ValueError: the ONNX network needs operators outside the standard set or acts differently; nothing is written.
     """
-    path = Path(path)
+    path, carry, obs_shape = Path(path), policy.carry, policy.obs_shape
     shapes = {name: jax.ShapeDtypeStruct(np.shape(value), value.dtype) for name, value in carry.items()}
     inputs = jax.eval_shape(lambda: spaces.zeros({name: tuple(obs_shape[name]) for name in sorted(obs_shape)}))
 
     def named_step(carry: Carry, obs: dict[str, jax.Array]) -> tuple[Carry, tuple[jax.Array, ...]]:
-        carry, action = step(carry, obs)
+        carry, action = policy.step(carry, obs)
         return carry, (action.astype(jnp.float32),)
 
-    converted = Converted.of(Network(named_step, shapes, dict(inputs)), check_steps)
+    converted = Converted.of(Network(named_step, shapes, dict(inputs)), CHECK_STEPS)
     vehicle = _describe(contract, "")
     table = {
         "schema": SCHEMA,
@@ -237,7 +238,7 @@ def export_sensing(
         "action": {"kind": "box", "size": 2, **vehicle["action"]},
         **{name: vehicle[name] for name in ("rate_hz", "action_repeat", "task")},
     }
-    return _write_agent(path, converted, weights, table, vehicle_file)
+    return _write_agent(path, converted, policy.weights, table, vehicle_file)
 
 
 def _write_agent(

@@ -109,6 +109,7 @@ def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: floa
     env_steps = int(state.env_steps)
     pretraining = 0 if env_steps else sum(pretrain.counters(state).values())
     state = host_replay.revealed(state)
-    path = checkpoint.save(out / "checkpoints", state, config, env_steps, wall_s, filled, pretraining)
+    moment = checkpoint.Moment(env_steps, wall_s, pretraining)
+    path = checkpoint.save(out / "checkpoints", state, config, moment, filled)
     parallel.wait_for_all("checkpoint written")  # only the first process writes; the others may read it next
     return path

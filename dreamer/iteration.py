@@ -147,9 +147,8 @@ def collect(
     greedy = exploration.greedy(config, env.num_envs)
     if greedy is not None:
         greedy = jnp.concatenate([greedy] * (1 + config.mirror))
-    carry, action = agents.act(
-        config, state.agent.params, state.carry, frame.obs, frame.is_first, policy_key, noise=drawn, greedy=greedy
-    )
+    choice = agents.Choice(policy_key, drawn, greedy)
+    carry, action = agents.act(config, state.agent.params, state.carry, frame.obs, frame.is_first, choice)
     random_action = actions.random(random_key, action.shape[:1]) if drawn is None else exploration.uniform(drawn)
     action = jnp.where(started(config, state) & (not always_random), action, random_action)
     real = action[: env.num_envs]

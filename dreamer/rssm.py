@@ -6,6 +6,7 @@ Inside the learner the time axis leads, so that scans slice contiguous memory an
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -132,14 +133,21 @@ def observe_step(
     return Latent(deter, stoch.astype(deter.dtype))
 
 
+class Sequences(NamedTuple):
+    """What B agents did and saw in T steps."""
+
+    actions: jax.Array
+    """(T, B, A), the action taken BEFORE each image."""
+    tokens: jax.Array
+    """(T, B, E)."""
+    is_first: jax.Array
+    """(T, B) bool; there, state and action are zeroed."""
+    uniform: jax.Array
+    """(T, B, S) random numbers in [0, 1)."""
+
+
 def observe(
-    config: DreamerConfig,
-    params: Params,
-    start: Latent,
-    actions: jax.Array,
-    tokens: jax.Array,
-    is_first: jax.Array,
-    uniform: jax.Array,
+    config: DreamerConfig, params: Params, start: Latent, sequences: Sequences
 ) -> tuple[Latent, jax.Array]:
     """Posterior states along sequences.
 
@@ -151,14 +159,12 @@ def observe(
         config: sizes.
         params: from `init`.
         start: state (B, ...) before the first step.
-        actions: (T, B, A), the action taken BEFORE each image.
-        tokens: (T, B, E).
-        is_first: (T, B) bool; there, state and action are zeroed.
-        uniform: (T, B, S) random numbers in [0, 1).
+        sequences: of actions and observations.
 
     Returns:
         States (T, B, ...) with straight-through gradients, and posterior probabilities (T, B, S, C).
     """
+    actions, tokens, is_first, uniform = sequences
     dtype = start.deter.dtype
     d, h, g = config.deter, config.hidden, config.blocks
     steps = is_first.shape

@@ -26,7 +26,8 @@ def play(env: FunctionalEnv, config: DreamerConfig, params: Params, key: jax.Arr
     def one(loop: tuple, step_key: jax.Array) -> tuple[tuple, dict[str, Any]]:
         state, transition, carry = loop
         seen = {"obs": transition.obs, "prev_action": carry["action"], "is_first": transition.is_first}
-        carry, action = agent.act(config, params, carry, transition.obs, transition.is_first, step_key)
+        choice = agent.Choice(step_key)
+        carry, action = agent.act(config, params, carry, transition.obs, transition.is_first, choice)
         state, transition = env.step(state, actions.to_env(action))
         return (state, transition, carry), seen
 
@@ -55,10 +56,8 @@ def predict(config: DreamerConfig, params: Params, seen: dict[str, Any], context
     observe_key, imagine_key = jax.random.split(key)
     tokens = sensors.encode(config, params["enc"], jax.tree.map(lambda x: x[:context], seen["obs"]))
     uniform = jax.random.uniform(observe_key, (context, rows, config.stoch))
-    known, _ = rssm.observe(
-        config, params["dyn"], rssm.initial(config, rows), seen["prev_action"][:context], tokens,
-        seen["is_first"][:context], uniform,
-    )  # fmt: skip
+    steps_seen = rssm.Sequences(seen["prev_action"][:context], tokens, seen["is_first"][:context], uniform)
+    known, _ = rssm.observe(config, params["dyn"], rssm.initial(config, rows), steps_seen)
 
     def one(latent: Latent, x: tuple[jax.Array, jax.Array]) -> tuple[Latent, Latent]:
         deter = rssm.core(config, params["dyn"], latent, x[0])

@@ -84,9 +84,8 @@ def loss(
     steps = batch.reward.shape
     tokens = sensors.encode(config, params["enc"], batch.obs)
     uniform = parallel.own_rows(lambda rows: jax.random.uniform(key, (steps[0], rows, config.stoch)), steps[1:])
-    latent, post = rssm.observe(
-        config, params["dyn"], batch.start, batch.prev_action, tokens, batch.is_first, uniform
-    )
+    sequences = rssm.Sequences(batch.prev_action, tokens, batch.is_first, uniform)
+    latent, post = rssm.observe(config, params["dyn"], batch.start, sequences)
     prior = rssm.prior_probs(config, params["dyn"], latent.deter)
     dyn, rep = kl_losses(config, post, prior)
     features = latent.features()

@@ -100,10 +100,6 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     references = [load_any(path, "auto", arguments.reference_train, (), arguments.chained)
                   for path in arguments.reference]
     check_logs(log, references)
-    mine = {trial.name for trial in log.trials}
-    for path, other in zip(arguments.reference, references, strict=True):
-        if other.sha256 == log.sha256 and mine & {trial.name for trial in other.training}:
-            raise ValueError(f"--reference {path}: has the drives in question themselves. Give drives of other days.")
     vehicle = None
     if arguments.vehicle is not None:
         refuse_recording(arguments.vehicle, "a vehicle file. Drives of other days are given with --reference.")

@@ -11,15 +11,24 @@ from sysid.search.result import Progress
 from whill_mjx.io import command_line
 from whill_mjx.io.heartbeat import Heartbeat
 
+
+class OwnModels:
+    """Options of a command that may step a user's robot."""
+
+    model: str
+
+    @property
+    def shares_results(self) -> bool:
+        """Whether XLA may share results: it may abort then on a user's robot."""
+        return not steps_mjx(self.model)
+
+
 _heartbeats: list[Heartbeat] = []
 """That of the command which runs in this process; none where the package is used from Python."""
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
-    """`whill_mjx.io.command_line.run` with signs of life.
-
-    XLA shares results unless the command steps a user's robot (`--model`), on which it may abort then.
-    """
+    """`whill_mjx.io.command_line.run` with signs of life."""
 
     def alive(chosen: Any) -> None:
         with Heartbeat() as heartbeat:  # progress bars tick while something long is computed
@@ -29,8 +38,7 @@ def run(options: type, main: Callable[[Any], Any], description: str | None, **mo
             finally:
                 _heartbeats.remove(heartbeat)
 
-    command_line.run(options, alive, description, **more,
-                     shares=lambda chosen: not steps_mjx(getattr(chosen, "model", None)))
+    command_line.run(options, alive, description, **more)
 
 
 def stage(text: str) -> None:

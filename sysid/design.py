@@ -2,8 +2,7 @@
 
 Of a library of manoeuvres within limits of speed and room, the one is chosen that shrinks the uncertainty of the
 parameters most: A-optimal (the sum of variances, which the largest uncertainty rules) or D-optimal (the volume), both
-on the subspace that driving determines. `best_splitting_manoeuvre` chooses the one that best separates two effects
-(T-optimality: what is left of one's signature after the base parameters and the other have explained what they can).
+on the subspace that driving determines.
 
 Residuals of driving logs are autocorrelated: information is divided by INFLATION, so that planned intervals are honest.
 """
@@ -12,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, check_known, listen, refusing, starts
 
@@ -23,13 +22,12 @@ import numpy as np
 
 from sysid import command_line
 from sysid.errors.pose_objective import Noise
-from sysid.intervals.design import DEFAULT, Criterion, propose
+from sysid.intervals.design import Criterion, Subject, propose
 from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
 from whill_mjx.io.folders import check_place
 from whill_mjx.vehicle.parameters import describe
-from whill_mjx.vehicle.specs import VehicleSpec
 
 
 @dataclass(frozen=True)
@@ -69,26 +67,27 @@ def main(config: DesignConfig) -> list[Path]:
 
     with refusing():
         check_out(config)
-        spec, params, intervals, noise = load_subject(config.vehicle)
+        subject = load_subject(config.vehicle)
         for name in config.parameters:
-            check_known("--parameters", name, describe(params))
-    limits = Limits(
-        max(spec.v_min, -1.0) if config.v_min is None else config.v_min,
-        min(spec.v_max, 1.0) if config.v_max is None else config.v_max,
-        min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
-        float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
-        config.seconds)
+            check_known("--parameters", name, describe(subject.params))
+    spec = subject.spec
     with refusing():
-        chosen, plans, space, before = propose(spec, params, limits, noise, config.channels, intervals,
-                                               config.criterion, config.count, config.parameters or None)
+        limits = Limits(
+            max(spec.v_min, -1.0) if config.v_min is None else config.v_min,
+            min(spec.v_max, 1.0) if config.v_max is None else config.v_max,
+            min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
+            float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
+            config.seconds)
+        found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
+                        names=config.parameters or None)
     paths = []
-    for number, plan in enumerate(chosen, start=1):
+    for number, plan in enumerate(found.chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
         command = plan.candidate.command
         write_csv(path, COMMAND_HEADER, command.table)
         paths.append(path)
-    print(text(chosen, plans, space, before, config.criterion))
-    paths.append(write_page(config.out.with_suffix(".html"), chosen, plans, space, before, limits, config))
+    print(text(found, config.criterion))
+    paths.append(write_page(config.out.with_suffix(".html"), found, limits, config))
     for path in paths:
         print(f"wrote {path}")
     return paths
@@ -104,14 +103,14 @@ def check_out(config: DesignConfig) -> None:
     check_place("--out", config.out)
 
 
-def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, float]], Noise]:
-    """Spec, parameters, known intervals and noise of a built-in vehicle, a vehicle file, or the folder of a fit."""
+def load_subject(name: str) -> Subject:
+    """What is known of a built-in vehicle, of that of a vehicle file, or of that of the folder of a fit."""
     from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 
     refuse_recording(name, "a built-in vehicle, a vehicle file, or the folder of a fit.")
     if not Path(name).is_dir():
         spec, params, _ = load_vehicle(name)
-        return spec, params, load_intervals(name) if name.endswith(".toml") else {}, DEFAULT
+        return Subject(spec, params, load_intervals(name) if name.endswith(".toml") else {})
     from sysid.pages.report import read_report
 
     file = str(Path(name) / "vehicle.toml")
@@ -127,7 +126,7 @@ def load_subject(name: str) -> tuple[VehicleSpec, Any, dict[str, tuple[float, fl
     found = report["noise"].get("scale")
     scale = check_table(str(Path(name) / "report.json"), fields, found, "noise.scale", others=True)
     noise = Noise(np.array([scale[key] for key in outside]), np.array([scale[key] for key in own]), "fit")
-    return spec, params, load_intervals(file), noise
+    return Subject(spec, params, load_intervals(file), noise)
 
 
 def cli() -> None:

@@ -35,7 +35,7 @@ STOPPED = "stopped; give the same command again to go on."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments(FitConfig):
+class Arguments(command_line.OwnModels, FitConfig):
     """Command line of `python -m sysid.fit`."""
 
     dataset: Path

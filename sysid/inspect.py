@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import listen, refusing, starts
+from whill_mjx.io.command_line import OptionError, listen, refusing, starts
 
 if starts(__name__):
     listen()
@@ -108,6 +108,8 @@ def main(config: InspectConfig) -> dict[str, Any]:
         with refusing():
             return inspect_robot(config)
     with refusing():
+        if config.wheels:
+            raise OptionError(f"--wheels: {config.dataset} is a driving log; only a robot file has joints.")
         log = load_whole(config.dataset, config.select, config.format)
     if config.out is None:
         return look(config, log)[0]

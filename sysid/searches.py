@@ -29,7 +29,7 @@ from sysid.logs.measured import load_any
 from sysid.logs.records import Log
 from sysid.pages.plots import write_search_plot
 from sysid.pages.report import code_hashes, write_report
-from sysid.search.comparison import METHODS, NEAR, Judge, arrivals, trace
+from sysid.search.comparison import METHODS, NEAR, Effort, Judge, arrivals, trace
 from sysid.search.fitting import Problem, check_settings, make_problem
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
@@ -42,7 +42,7 @@ OUTPUTS = ("searches.json", "searches.png", "searches.html")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments(FitConfig):
+class Arguments(command_line.OwnModels, FitConfig):
     """Command line of `python -m sysid.searches`; what is fitted is set as for `sysid.fit`."""
 
     dataset: Path
@@ -79,13 +79,13 @@ def main(arguments: Arguments) -> list[Trace]:
 def compare(arguments: Arguments, log: Log, problem: Problem) -> list[Trace]:
     """Run, write and print in a folder that is held."""
     judge = Judge(problem, log)
+    effort = Effort(arguments.trials, arguments.iterations, arguments.starts)
     traces = []
     progress, close = command_line.progress_bar(len(arguments.methods) * len(arguments.seeds), "searches", "run")
     try:
         for method in arguments.methods:
             for seed in arguments.seeds:
-                traces.append(trace(problem, judge, log.spec.track, method, seed, evaluations=arguments.trials,
-                                    iterations=arguments.iterations, start_count=arguments.starts))
+                traces.append(trace(problem, judge, method, seed, effort))
                 progress(1, f"{method}: cost {traces[-1].cost[-1]:.4g}")
     finally:
         close()

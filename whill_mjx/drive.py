@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, listen, refusing, run, starts
+from whill_mjx.io.command_line import SEED, OptionError, Range, check_once, listen, refusing, run, starts
 
 if starts(__name__):
     listen()
@@ -31,6 +31,7 @@ from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.io.folders import check_place, new_folder
 from whill_mjx.logs.dataset import (
     COMMAND_HEADER,
+    Noise,
     write_csv,
     write_encoder,
     write_fields,
@@ -105,10 +106,10 @@ def main(options: DriveOptions) -> Path:
             f"non-finite in {lost}. Bring the effects' values closer to those in docs/effects.md."
         )
     with new_folder(options.out) as partial:
-        noise = options.noise_levels if options.noise else None
+        noise = Noise(options.noise_levels if options.noise else None, random)
         for index, (name, command, _) in enumerate(trials):
             motion = {sensor: motions[sensor][index] for sensor in motions}
-            write_streams(partial / "trials" / name, command, motion, options.sensors, noise, random)
+            write_streams(partial / "trials" / name, command, motion, options.sensors, noise)
         write_fields(partial, spec, [name for name, _, _ in trials if name.rsplit("_", 1)[0] in options.held_out])
         truth = {"vehicle": options.vehicle, "effects": " ".join(options.effects), "seed": options.seed}
         save_vehicle(partial / "vehicle.toml", spec, params, provenance=truth)
@@ -139,6 +140,8 @@ def parse_effect(text: str) -> tuple[str, dict[str, float]]:
     values: dict[str, float] = {}
     for pair in filter(None, rest.split(",")):
         key, equals, number = pair.partition("=")
+        if key in values:
+            raise ValueError(f"effect {text!r}: {key} is given twice. Leave one out.")
         try:
             values[key] = float(number)
         except ValueError:
@@ -158,9 +161,8 @@ def parse_effect(text: str) -> tuple[str, dict[str, float]]:
 
 
 def write_streams(
-    folder: Path, command: np.ndarray, motion: dict[str, np.ndarray], sensors: Sensors, noise: SensorNoise | None,
-    random: np.random.Generator,
-) -> None:  # fmt: skip
+    folder: Path, command: np.ndarray, motion: dict[str, np.ndarray], sensors: Sensors, noise: Noise
+) -> None:
     """Write the streams of one trial: its commands, and what each sensor reports of the motion (T, C) it sees."""
     write_csv(folder / "command.csv", COMMAND_HEADER, command)
     duration, dt = float(command[-1, 0]), VehicleConfig().physics_dt
@@ -170,14 +172,14 @@ def write_streams(
         return t, seen(t, getattr(sensors, f"{sensor}_latency"), dt, motion[sensor])
 
     if sensors.ground_truth_rate:
-        write_ground_truth(folder, *sampled("ground_truth"), noise, random)
+        write_ground_truth(folder, *sampled("ground_truth"), noise)
     if sensors.odometry_rate:
-        write_odometry(folder, *sampled("odometry"), noise, random)
+        write_odometry(folder, *sampled("odometry"), noise)
     if sensors.imu_rate:
-        write_imu(folder, *sampled("imu"), noise, random)
+        write_imu(folder, *sampled("imu"), noise)
     if sensors.encoder_rate:
         t, angles = sampled("encoder")
-        write_encoder(folder, t, sensors.encoder_latency, angles, noise, random)
+        write_encoder(folder, t, sensors.encoder_latency, angles, noise)
 
 
 def record(
@@ -243,6 +245,7 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
         raise OptionError("--manoeuvre: none is given. Name one, or leave the option out for figure_eight.")
     if len(set(names)) != len(names):
         raise ValueError(f"--manoeuvre {' '.join(names)}: one is given twice. Repeat a drive with --replicates.")
+    check_once("--effects", [text.partition(":")[0] for text in options.effects])
     if options.replicates < 1:
         raise ValueError(f"--replicates {options.replicates}: must be at least 1. Leave it out for a single drive.")
     absent = sorted(set(options.held_out) - set(names))

@@ -153,6 +153,8 @@ def make_env(
             no lane to furnish.
     """
     task = make_task(task) if isinstance(task, str) else task
+    if not isinstance(task, Task):
+        raise ValueError(f"task is {task!r}; give a Task such as Corridor(), or the name of one.")
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
     check_task(task)
@@ -295,7 +297,7 @@ def repainted(env: Env, state: State, key: jax.Array) -> State:
 
 def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tuple[State, Outcome]:
     """State and outcome after one environment step, without the image."""
-    command, unreadable = scale_action(env.task, action), jnp.isnan(action).any()
+    command, unreadable = scale_action(env.task, action), ~jnp.isfinite(action).all()
     if env.task.action_repeat == 1:
         return _control_period(env, params, state, command, unreadable)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, listen, refusing, run, starts
+from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, check_once, listen, refusing, run, starts
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
 if starts(__name__):
@@ -137,7 +137,9 @@ def make_plan(options: EvaluateOptions) -> Plan:
     policy = None if options.policy in SCRIPTED else load_policy(find_policy(options.policy), options.runtime)
     task = choose_task(options, policy)
     plan = Plan(options, task, policy, [parse_sweep(text) for text in chosen_sweeps(options, task)])
-    others = dict(_named(text) for text in options.baselines)
+    pairs = [_named(text) for text in options.baselines]
+    check_once("--baselines", [name for name, _ in pairs])
+    others = dict(pairs)
     plan.drivers[plan.main_name] = plan.driver(plan.course())
     for name, source in others.items():
         plan.drivers[name] = make_driver(source, None, plan.course(), options)

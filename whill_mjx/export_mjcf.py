@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from whill_mjx.io.command_line import PHYSICS_DT, listen, refusing, run, starts
 
@@ -122,8 +122,8 @@ class VehicleForces:
         elif data.time > self._time:
             self._before, self._moved = self._after, True
         self._time = data.time
-        state, force = self._advance(self._static, self._params, self._before, data.qpos[self._qpos],
-                                     data.qvel[self._qvel], data.ctrl[self._ctrl], self._moved)
+        call = _Call(data.qpos[self._qpos], data.qvel[self._qvel], data.ctrl[self._ctrl], self._moved)
+        state, force = self._advance(self._static, self._params, self._before, call)
         self._after = state
         data.qfrc_applied[self._qvel] = np.asarray(force)
 
@@ -281,13 +281,22 @@ def _start(model: VehicleModel, params: VehicleParams, qvel: np.ndarray) -> dict
     return {"memory": memory, "encoder": encoder, "reading": encoder, "motion": motion}
 
 
+class _Call(NamedTuple):
+    """What MuJoCo holds when it calls."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+    command: jax.Array
+    moved: bool
+    """A step has passed since the call before."""
+
+
 def _advance(
-    model: VehicleModel, params: VehicleParams, before: dict[str, Any], qpos: jax.Array, qvel: jax.Array,
-    command: jax.Array, moved: jax.Array,
+    model: VehicleModel, params: VehicleParams, before: dict[str, Any], call: _Call
 ) -> tuple[dict[str, Any], jax.Array]:
-    """State after the present call, and qfrc_applied (8,); `moved` where a step has passed since the call before."""
-    dtype = before["encoder"].x.dtype
-    qpos, qvel, command = (jnp.asarray(value, dtype) for value in (qpos, qvel, command))
+    """State after the present call, and qfrc_applied (8,)."""
+    dtype, moved = before["encoder"].x.dtype, call.moved
+    qpos, qvel, command = (jnp.asarray(value, dtype) for value in call[:3])
     encoder = replace(advance_odometry(before["encoder"], qvel[6:8], model), gyro=qvel[5])
     sensed, reading = apply_chain(params.effects, before["memory"], "sensing", encoder, before["motion"])
     memory, encoder, reading = jax.tree.map(

@@ -65,6 +65,10 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         raise ValueError(f"--log {options.log}: nothing is fitted to it, since --vehicle is given. Leave one out.")
     if options.log is not None and not options.log.exists():
         raise FileNotFoundError(f"--log {options.log}: no such dataset. Correct the path.")
+    if options.log is not None:
+        from sysid import load_any
+
+        load_any(options.log)
     check_task(preset.task)
     if any(text != "fit" for text in preset.vary):
         variations_of([text for text in preset.vary if text != "fit"], None)

@@ -16,7 +16,7 @@ def _promises(content: dict[str, Any]) -> list[Row]:
         ("damaged files: more than 500 MB", "fuzz_memory", "{fuzz_memory|.readers} readers"),
         ("mistaken commands: tracebacks", "option_tracebacks", "{option_tracebacks|.command_lines} lines"),
         ("kills: work lost beyond a minute", "kills_lost", "{kills_lost|.kills} kills"),
-        ("kills: other bits in the end", "kills_different", "{kills_different|.kills} kills"),
+        ("kills: other bits in the end", "kills_different", "{kills_different|.ended} ended runs"),
         ("kills: half-written files", "kills_half_written", "{kills_half_written|.kills} kills"),
         ("Ctrl-C: ends without exit code 130", "ctrl_c_wrong_ends", "{ctrl_c_wrong_ends|.interrupts} interrupts"),
         ("Ctrl-C to exit, 95 % [s]", "ctrl_c_p95_s", "{ctrl_c_wrong_ends|.interrupts} interrupts"),

@@ -61,19 +61,19 @@ class _Xml:
         )
         return name
 
-    def geom(self, kind: str, size, pos, material: str, solid: bool = False, euler=(0, 0, 0), extra: str = "") -> None:
+    def geom(self, kind: str, size, pos, material: str, solid: bool = False, euler=(0, 0, 0)) -> None:
         """One geom; solid ones touch the chair."""
         numbers = [" ".join(f"{value:.6g}" for value in part) for part in (size, pos, euler)]
         touch = 'contype="1" conaffinity="1"' if solid else ""
         self.world.append(
             f'<geom type="{kind}" size="{numbers[0]}" pos="{numbers[1]}" euler="{numbers[2]}" material="{material}" '
-            f"{touch} {extra}/>"
+            f"{touch}/>"
         )
 
-    def wall(self, side: int, middle: float, height: float, z: float, half: float, thick: float, material: str) -> None:
-        """A flat picture on a side wall: its own z looks into the room."""
-        y = side * (WIDTH / 2 - thick)
-        self.geom("box", (half, height, thick), (middle, y, z), material, euler=(90, 0 if side > 0 else 180, 0))
+    def wall(self, side: int, place, half, thick: float, material: str) -> None:
+        """A flat picture on a side wall, by x and z of its middle and its half width and height [m]."""
+        at = (place[0], side * (WIDTH / 2 - thick), place[1])  # its own z looks into the room
+        self.geom("box", (*half, thick), at, material, euler=(90, 0 if side > 0 else 180, 0))
 
     def compile(self, lights: str, visual: str) -> mujoco.MjModel:
         xml = f"""
@@ -174,8 +174,8 @@ def _doors(xml: _Xml, random, count: int) -> None:
         colour = random.choice([(0.5, 0.36, 0.22), (0.62, 0.62, 0.6), (0.35, 0.4, 0.45), (0.75, 0.7, 0.6)])
         leaf = xml.material(paint.door(random, colour), uniform=False)
         frame = xml.material(colour=tuple(np.asarray(colour) * 0.6))
-        xml.wall(side, x, 1.04, 1.04, 0.5, 0.012, frame)
-        xml.wall(side, x, 1.0, 1.0, 0.44, 0.02, leaf)
+        xml.wall(side, (x, 1.04), (0.5, 1.04), 0.012, frame)
+        xml.wall(side, (x, 1.0), (0.44, 1.0), 0.02, leaf)
 
 
 def _carton(xml: _Xml, random, at, half, yaw: float, colour) -> None:
@@ -193,7 +193,7 @@ def _furnished(xml: _Xml, random, start, carton_at) -> Room:
     _shell(xml, [coat] * 4, ground, height, above)
     foot = xml.material(colour=(0.3, 0.28, 0.26))
     for side in (-1, 1):
-        xml.wall(side, 2.25, 0.05, 0.05, 4.25, 0.01, foot)
+        xml.wall(side, (2.25, 0.05), (4.25, 0.05), 0.01, foot)
     _doors(xml, random, 3)
     half = (0.2, 0.2, 0.225)
     _carton(xml, random, carton_at, half, 0.0, np.array([0.62, 0.46, 0.3]) * random.uniform(0.8, 1.1))
@@ -226,8 +226,8 @@ def _unseen(xml: _Xml, random, start, carton_at) -> Room:
     for _ in range(int(random.integers(2, 7))):
         poster = xml.material(paint.letters(random, random.uniform(0, 1, 3), random.uniform(0, 1, 3)), uniform=False)
         side = int(random.choice([-1, 1]))
-        place = (random.uniform(-0.5, 6), random.uniform(0.2, 0.45), random.uniform(0.9, 1.7))
-        xml.wall(side, *place, random.uniform(0.15, 0.5), 0.008, poster)
+        x, height, z, half = (random.uniform(*ends) for ends in ((-0.5, 6), (0.2, 0.45), (0.9, 1.7), (0.15, 0.5)))
+        xml.wall(side, (x, z), (half, height), 0.008, poster)
     size = (random.uniform(0.12, 0.3), random.uniform(0.12, 0.3), random.uniform(0.12, 0.4))
     yaw = random.uniform(-math.pi / 2, math.pi / 2)
     across = size[0] * abs(math.sin(yaw)) + size[1] * abs(math.cos(yaw))

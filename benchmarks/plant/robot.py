@@ -122,12 +122,14 @@ class RobotNode:
 
     def _publish(self, rows: np.ndarray, poses: np.ndarray) -> None:
         for t, x, y, yaw, v, omega in rows.tolist():
-            self._odometry.publish(self._message(t, "odom", x, y, yaw, v, omega))
+            self._odometry.publish(self._message(t, "odom", (x, y, yaw), v, omega))
         for t, x, y, yaw in poses.tolist():
-            self._truth.publish(self._message(t, "map", x, y, yaw))
+            self._truth.publish(self._message(t, "map", (x, y, yaw)))
         self._clock(*stamp_of(self.now))
 
-    def _message(self, t: float, frame: str, x: float, y: float, yaw: float, v: float = 0.0, omega: float = 0.0) -> Any:
+    def _message(self, t: float, frame: str, pose: tuple[float, float, float], v: float = 0.0, omega: float = 0.0
+                 ) -> Any:
+        x, y, yaw = pose
         message = self._odometry_type()
         message.header.stamp.sec, message.header.stamp.nanosec = stamp_of(self._base + t)
         message.header.frame_id, message.child_frame_id = frame, "base_link"

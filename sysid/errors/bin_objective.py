@@ -23,14 +23,16 @@ from sysid.errors.prior import Prior
 from sysid.errors.space import STEP, Space
 from sysid.logs.records import Trial
 from sysid.replay.arrays import namespace
-from sysid.replay.cores import on_processor
+from sysid.replay.cores import cores, on_processor
 from sysid.replay.quotients import Quotients
 from sysid.replay.records import Simulated
 from sysid.search import least_squares
+from whill_mjx.io.steps import steps_of_rows
 
 LONG = 8
 """Bins of memory of the filter, where a log allows so much: the noise of a pose itself cancels from bin to bin, which a
 short memory takes for a vehicle that drifts."""
+SETS = 64  # that a core replays between two saves: seconds for minutes of driving
 ROWS = 10  # times as many bins as the filter has coefficients in each row
 
 
@@ -73,7 +75,11 @@ class FeatureObjective:
 
     def simulate(self, u: np.ndarray) -> np.ndarray:
         """Features (N, B, K, C) at unit coordinates (N, P)."""
-        return self.features.of(self.replay.simulate(self.space.to_values(u)))
+        def compute(u: np.ndarray) -> list[np.ndarray]:
+            return [self.features.of(self.replay.simulate(self.space.to_values(u)))]
+
+        [found] = steps_of_rows("features", compute, u, SETS * cores() if on_processor() else len(u))
+        return found
 
     def weighted_cost(self, u: np.ndarray) -> np.ndarray:
         """Mean squared residual (N,)."""

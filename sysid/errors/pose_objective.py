@@ -24,7 +24,9 @@ from sysid.errors.space import Residuals, Space
 from sysid.logs.metrics import replicate_noise
 from sysid.logs.records import Trial
 from sysid.replay.arrays import added, namespace
+from sysid.replay.cores import on_processor
 from sysid.replay.records import Measured, Simulated
+from whill_mjx.io.steps import steps_of_rows
 
 DEFAULT_NOISE = {"ground_truth": np.array([0.02, 0.02, 0.02]), "odometry": np.array([0.02, 0.02, 0.02, 0.02, 0.04])}
 """x, y [m], yaw [rad] and x, y, yaw, v [m/s], omega [rad/s]; only their ratio matters until they are re-estimated."""
@@ -189,6 +191,10 @@ class Objective:
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, B, K) and their derivatives by u (N, B, K, P)."""
+        residual, jacobian = steps_of_rows("derivatives", self._jacobian, u, 1 if on_processor() else len(u))
+        return residual, jacobian
+
+    def _jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         simulated, derivative = self.replay.jacobian(self.space.to_values(u))
         residual, jacobian = self._whiten(simulated, derivative)
         assert jacobian is not None

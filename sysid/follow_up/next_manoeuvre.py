@@ -151,8 +151,9 @@ def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[
             if speed < 0.02:
                 continue
             for heading in headings:
-                drive = _fitting(name, speed, size * omega, longest - 2 * STANDSTILL, math.radians(heading), dt,
-                                 low, high, longest)
+                whole = Drive(name, speed, size * omega, longest - 2 * STANDSTILL, (0.0, 0.0, math.radians(heading)),
+                              dt)
+                drive = _fitting(whole, low, high, longest)
                 if drive is not None:
                     command = drive.command
                     found.setdefault((command.v.tobytes(), command.omega.tobytes(), heading), drive)
@@ -171,13 +172,13 @@ def _space(trials: Sequence[Trial]) -> tuple[np.ndarray, np.ndarray]:
     return points.min(0), points.max(0)
 
 
-def _fitting(name: str, v: float, omega: float, seconds: float, heading: float, dt: float, low: np.ndarray,
-             high: np.ndarray, longest: float) -> Drive | None:
+def _fitting(whole: Drive, low: np.ndarray, high: np.ndarray, longest: float) -> Drive | None:
     """A manoeuvre as long as time and space allow, placed in the middle of the space; None where none fits."""
+    heading = whole.start[2]
     for fraction in FRACTIONS:
-        drive = Drive(name, v, omega, math.floor(10 * fraction * seconds + 1e-9) / 10, (0.0, 0.0, heading), dt)
+        drive = replace(whole, seconds=math.floor(10 * fraction * whole.seconds + 1e-9) / 10)
         command = drive.command
-        if command.t[-1] + dt > longest + 1e-9:
+        if command.t[-1] + drive.dt > longest + 1e-9:
             continue
         ideal = ideal_replay(_as_trial(command, Start(yaw=heading), longest, 200, 200)).ground_truth
         assert ideal is not None

@@ -1,9 +1,9 @@
-"""Which manoeuvre shrinks the uncertainty of the parameters most, and which splits two hypotheses."""
+"""Which manoeuvre shrinks the uncertainty of the parameters most."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +12,6 @@ from sysid.errors.pose_objective import DEFAULT_NOISE, Noise, Objective
 from sysid.errors.space import Space, make_space
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, placement
-from sysid.logs.records import Command
 from sysid.replay.records import Measured, Plant, Simulated
 from sysid.replay.rollout import Replay, make_batch, vehicle_plant
 from whill_mjx.vehicle.config import VehicleConfig
@@ -136,27 +135,47 @@ def rank(
     return sorted(plans, key=lambda plan: plan.score(criterion))
 
 
+@dataclass(frozen=True)
+class Subject:
+    """What is known of the vehicle that will drive."""
+
+    spec: VehicleSpec
+    params: Any
+    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """90 % intervals by parameter name."""
+    noise: Noise = DEFAULT
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Manoeuvres to drive next, and why."""
+
+    chosen: list[Plan]
+    plans: list[Plan]
+    """All plans for the first choice, best first."""
+    space: Space
+    before: np.ndarray
+    """(P,) deviations before the drives, in unit coordinates."""
+
+
 def propose(
-    spec: VehicleSpec, params: Any, limits: Limits | None = None, noise: Noise = DEFAULT, channels: str = "both",
-    intervals: dict[str, tuple[float, float]] | None = None, criterion: Criterion = "a", count: int = 1,
-    names: Sequence[str] | None = None, candidates: Sequence[Candidate] | None = None, plant: Plant | None = None,
-) -> tuple[list[Plan], list[Plan], Space, np.ndarray]:
+    subject: Subject, limits: Limits | None = None, *, channels: str = "both", criterion: Criterion = "a",
+    count: int = 1, names: Sequence[str] | None = None,
+) -> Proposal:
     """The next manoeuvres of a vehicle.
 
     Args:
-        intervals: what is known, by parameter name.
+        channels: what will be measured.
         count: how many manoeuvres, chosen one after the other.
         names: parameters of interest; by default all that a log can determine.
-
-    Returns:
-        The chosen ones, all plans for the first choice (best first), the space, and the deviations (P,) before.
     """
+    spec, params = subject.spec, subject.params
     limits = limits or Limits(max(spec.v_min, -1.0), min(spec.v_max, 1.0), min(spec.omega_max, 1.0))
     space = make_space(params, spec, names)
-    plant = plant or vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
-    candidates = tuple(candidates or library(limits))
+    plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
+    candidates = tuple(library(limits))
     objective = candidate_objective(plant, lambda values: set_values(params, space.names, values), space, candidates,
-                                    noise, channels)
+                                    subject.noise, channels)
     paths = driven_paths(objective)
     starts = [placement(path, limits) for path in paths]
     inside = [k for k, start in enumerate(starts) if start is not None]
@@ -164,7 +183,7 @@ def propose(
         raise ValueError(f"the vehicle leaves {limits.room[0]:g} x {limits.room[1]:g} m in every manoeuvre. Give a "
                          "larger --space, or lower --v-max.")
     found = information(objective, space.initial)[inside]
-    prior = prior_information(space, intervals)
+    prior = prior_information(space, subject.intervals)
     before = np.sqrt(np.diag(np.linalg.inv(prior)))
     ready = [candidates[k] for k in inside], [paths[k] for k in inside], [starts[k] for k in inside]
     chosen: list[Plan] = []
@@ -174,7 +193,7 @@ def propose(
         first = first or plans
         chosen.append(plans[0])
         prior = prior + plans[0].information
-    return chosen, first, space, before
+    return Proposal(chosen, first, space, before)
 
 
 def driven_paths(objective: Objective) -> list[np.ndarray]:
@@ -187,74 +206,3 @@ def driven_paths(objective: Objective) -> list[np.ndarray]:
         assert stream is not None
         paths.append(table[k, : len(stream.t), :2])
     return paths
-
-
-def separation(signature_a: np.ndarray, signature_b: np.ndarray, jacobian: np.ndarray) -> float:
-    """z-value of effect a where base parameters and effect b may explain what they can.
-
-    Args:
-        signature_a, signature_b: (K,) whitened change that each effect makes.
-        jacobian: (K, P) whitened derivatives by the base parameters.
-
-    Returns:
-        Length of what is left of a, in standard deviations of autocorrelated noise (INFLATION).
-    """
-    known = np.column_stack([jacobian, signature_b])
-    scale = np.linalg.norm(known, axis=0)
-    known = known[:, scale > 1e-9] / scale[scale > 1e-9]
-    basis, size, _ = np.linalg.svd(known, full_matrices=False)
-    basis = basis[:, size > 1e-8 * max(float(size.max(initial=0.0)), 1e-30)]
-    left = signature_a - basis @ (basis.T @ signature_a)
-    return float(np.linalg.norm(left) / np.sqrt(INFLATION))
-
-
-def best_splitting_manoeuvre(
-    spec: VehicleSpec, params: Any, base_space: Space, effect_a_params: Any, effect_b_params: Any,
-    candidates: Sequence[Candidate], noise: Noise = DEFAULT, channels: str = "both", plant: Plant | None = None,
-    apply: Callable[[Any], Any] | None = None,
-) -> tuple[str, Command, float]:
-    """The manoeuvre that best separates effect a from effect b.
-
-    Args:
-        params: the base vehicle.
-        base_space: base parameters that a fit would adapt; its initial values are those of `params`.
-        effect_a_params, effect_b_params: the base vehicle with one effect each, at a size worth knowing.
-        candidates: from `sysid.logs.manoeuvre_library.library`.
-        plant: by default the simulator's vehicle of `spec`.
-        apply: values (P,) of the base space -> the plant's parameters; by default they are set in `params`.
-
-    Returns:
-        Name, command and z-value: the less of both directions, a beside b and b beside a. Below about 3 no candidate
-        separates them, and another sensor is needed.
-    """
-    scores = splitting_scores(spec, params, base_space, effect_a_params, effect_b_params, candidates, noise, channels,
-                              plant, apply)
-    best = int(np.argmax(scores))
-    return candidates[best].name, candidates[best].command, float(scores[best])
-
-
-def splitting_scores(
-    spec: VehicleSpec, params: Any, base_space: Space, effect_a_params: Any, effect_b_params: Any,
-    candidates: Sequence[Candidate], noise: Noise = DEFAULT, channels: str = "both", plant: Plant | None = None,
-    apply: Callable[[Any], Any] | None = None,
-) -> np.ndarray:
-    """z-value (B,) of each candidate; arguments of `best_splitting_manoeuvre`."""
-    plant = plant or vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
-    if apply is None:
-        def apply(values: Any) -> Any:
-            return set_values(params, base_space.names, values)
-
-    objective = candidate_objective(plant, apply, base_space, candidates, noise, channels)
-    u = base_space.to_unit(base_space.initial)[None]
-    _, jacobian = (one[0] for one in objective.jacobian(u))  # (B, K, P)
-    batch, _ = make_batch(objective.trials, plant.dt)
-    signatures = []
-    for changed in (effect_a_params, effect_b_params):
-        replay = Replay(plant, batch, _always(changed))
-        signatures.append(replace(objective, replay=replay).residuals(u)[0])  # (B, K)
-    return np.array([min(separation(a, b, slope), separation(b, a, slope))
-                     for a, b, slope in zip(*signatures, jacobian, strict=True)])
-
-
-def _always(params: Any) -> Callable[[Any], Any]:
-    return lambda _: params

@@ -60,22 +60,31 @@ class Profile:
         return ", ".join(ends)
 
 
+@dataclass(frozen=True)
+class Minimum:
+    """Where a fit ended."""
+
+    u: np.ndarray  # (P,) unit coordinates
+    known: Uncertainty
+    """Intervals there, which set a grid's reach; a parameter that is not determined gets its whole range."""
+    robust: bool = False
+    """It is the minimum of the Huber loss."""
+
+
 def profile(
-    objective: Told, u: np.ndarray, known: Uncertainty, names: Sequence[str], *, points: int = POINTS,
-    iterations: int = ITERATIONS, robust: bool = False, progress: Progress | None = None,
+    objective: Told, at: Minimum, names: Sequence[str], *, points: int = POINTS, iterations: int = ITERATIONS,
+    progress: Progress | None = None,
 ) -> list[Profile]:
-    """Profile likelihoods at the fitted point u (P,), all points of a grid searched together.
+    """Profile likelihoods at the fitted point, all points of a grid searched together.
 
     Args:
-        known: intervals at u, which set the grid's reach; a parameter that is not determined gets its whole range.
         names: which parameters.
-        points: of the grid, besides u itself.
-        robust: u minimises the Huber loss.
+        points: of the grid, besides the fitted one.
 
     Raises:
         ValueError: a name is not searched.
     """
-    space = objective.space
+    space, u, known, robust = objective.space, at.u, at.known, at.robust
     check_names(space, names)
     sd = np.maximum(known.deviation, 1e-8)
     scale = _scale(objective, u, known, sd)

@@ -148,6 +148,8 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     else:
         from sysid.logs.inspection import load_whole
 
+        if config.columns:
+            raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
         log = load_whole(config.source, config.select)
         spec, notes = log.spec, list(log.notes)
         drives = [_moved(trial_drive(trial), config.truth_ahead, config.truth_turned) for trial in log.trials]

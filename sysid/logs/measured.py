@@ -564,6 +564,9 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     no command comes does so in replays too (`sysid.logs.command_timeout`). A note says each.
     """
     form = detect_format(path) if form == "auto" else form
+    if form == "dataset" and held_out and not train:
+        raise ValueError(f"{path}: its dataset.toml says which trials are held out. Give --train beside --held-out "
+                         "to choose both here, or leave --held-out out.")
     if form == "dataset":
         log: Log = in_windows(with_own_timeout(_without_held(load_log(path))))
         return without_standing(split(log, train, held_out) if train else log, str(path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,35 +13,47 @@ import numpy as np
 from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.replay.records import Plant
 from sysid.replay.rollout import make_batch, simulate, vehicle_plant
-from whill_mjx.logs.dataset import SensorNoise, write_fields, write_trial
+from whill_mjx.logs.dataset import Noise, SensorNoise, write_fields, write_trial
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES, Scenario, command_table
 from whill_mjx.vehicle.specs import VehicleSpec
 
 MEASUREMENT_DT = 0.05  # s
 
 
+@dataclass(frozen=True)
+class Schedule:
+    """What is driven."""
+
+    manoeuvres: tuple[str, ...] = tuple(PAPER_MANOEUVRES)
+    held_out: tuple[str, ...] = ("figure_eight",)
+    """Manoeuvres of which all replicates are held out."""
+    replicates: int = 3
+    """Drives per manoeuvre: same commands, other noise and start pose."""
+    scenario: Scenario | None = None
+    """Sizes of the manoeuvres."""
+    seed: int = 0
+    """Of start poses and noise."""
+
+
 def write_dataset(
-    folder: str | Path, spec: VehicleSpec, params: Any, *, manoeuvres: tuple[str, ...] = tuple(PAPER_MANOEUVRES),
-    held_out: tuple[str, ...] = ("figure_eight",), replicates: int = 3, scenario: Scenario | None = None,
-    noise: SensorNoise | None = None, seed: int = 0, plant: Plant | None = None,
+    folder: str | Path, spec: VehicleSpec, params: Any, schedule: Schedule = Schedule(), *,  # noqa: B008
+    noise: SensorNoise | None = None, plant: Plant | None = None,
 ) -> Path:
     """Drive the manoeuvres with a vehicle and write the log.
 
     Args:
         folder: dataset folder to create.
         spec, params: the vehicle; `params` holds the planted truth.
-        held_out: manoeuvres of which all replicates are held out.
-        replicates: drives per manoeuvre: same commands, other noise and start pose.
         plant: by default the simulator's vehicle of `spec`.
     """
     folder, noise = Path(folder), noise or SensorNoise()
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(schedule.seed)
     plant = plant or vehicle_plant(spec)
     trials = []
-    for manoeuvre in manoeuvres:
-        command = Command(*command_table(manoeuvre, scenario).T)
+    for manoeuvre in schedule.manoeuvres:
+        command = Command(*command_table(manoeuvre, schedule.scenario).T)
         t = np.arange(0.0, command.t[-1], MEASUREMENT_DT)
-        for replicate in range(1, replicates + 1):
+        for replicate in range(1, schedule.replicates + 1):
             x, y = random.uniform(-1.0, 1.0, 2)
             start = Start(float(x), float(y), float(random.uniform(-np.pi, np.pi)))
             blank = np.zeros_like(t)
@@ -54,6 +67,6 @@ def write_dataset(
         assert trial.ground_truth is not None
         count = len(trial.ground_truth.t)
         write_trial(folder / "trials" / trial.name, trial.ground_truth.t, trial.command.table,
-                    simulated.pose[i, :count], simulated.odometry[i, :count], noise, random)
-    write_fields(folder, spec, [trial.name for trial in trials if trial.manoeuvre in held_out])
+                    simulated.pose[i, :count], simulated.odometry[i, :count], Noise(noise, random))
+    write_fields(folder, spec, [trial.name for trial in trials if trial.manoeuvre in schedule.held_out])
     return folder

@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid.logs.records import OdometryStream, PoseStream, Prediction, Trial
 from whill_mjx.io.html import charts, legend, table
-from whill_mjx.io.svg import Line, line_chart
+from whill_mjx.io.svg import Axes, Line, line_chart
 
 POINTS = 240  # of a drawn path
 SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
@@ -82,9 +82,10 @@ def drive_pictures(shown: Mapping[str, Any], names: Mapping[str, str]) -> str:
     off = [Line(t, 100 * _off(measured, one), "", *style[name], 1.6) for name, one in replays.items()]
     turned = [Line(t, np.rad2deg(_turned(measured, one)), "", *style[name], 1.6) for name, one in replays.items()]
     items = [
-        line_chart(path, "x [m]", "y [m]", "path (dot: start)", equal=True, smallest=SMALLEST),
-        line_chart(off, "time [s]", "off by [cm]", "distance from where the vehicle was", smallest=1.0),
-        line_chart(turned, "time [s]", "off by [degrees]", "error of the heading (+: too far left)", smallest=0.5),
+        line_chart(path, "x [m]", "y [m]", "path (dot: start)", Axes(equal=True, smallest=SMALLEST)),
+        line_chart(off, "time [s]", "off by [cm]", "distance from where the vehicle was", Axes(smallest=1.0)),
+        line_chart(turned, "time [s]", "off by [degrees]", "error of the heading (+: too far left)",
+                   Axes(smallest=0.5)),
     ]
     kind = "held out: no fit has seen it" if shown["held_out"] else "a training drive"
     entries = [("measured", MEASURED), *((text, style[name][0]) for name, text in names.items())]

@@ -9,21 +9,20 @@ from typing import Any
 import numpy as np
 
 from sysid.errors.space import Space
-from sysid.intervals.design import Criterion, Plan
+from sysid.intervals.design import Criterion, Plan, Proposal
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
 from sysid.pages.loop_words import MANOEUVRE_WORDS
 from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, table
-from whill_mjx.io.svg import PALETTE, Line, line_chart
+from whill_mjx.io.svg import PALETTE, Axes, Line, line_chart
 from whill_mjx.logs.dataset import write_text
 
 SHOWN = 12  # candidates listed
 
 
-def text(
-    chosen: Sequence[Plan], plans: Sequence[Plan], space: Space, before: np.ndarray, criterion: Criterion
-) -> str:
+def text(found: Proposal, criterion: Criterion) -> str:
     """What was chosen, why, and what it changes."""
+    chosen, plans, space, before = found.chosen, found.plans, found.space, found.before
     lines = []
     for number, plan in enumerate(chosen, start=1):
         x, y, yaw = plan.start
@@ -62,17 +61,16 @@ def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
     return [name for name, deviation in zip(space.names, best, strict=True) if deviation > UNIDENTIFIABLE * PRIOR_SD]
 
 
-def write_page(
-    path: Path, chosen: Sequence[Plan], plans: Sequence[Plan], space: Space, before: np.ndarray, limits: Limits,
-    config: Any,
-) -> Path:
+def write_page(path: Path, found: Proposal, limits: Limits, config: Any) -> Path:
     """Write the page, whole or not at all."""
+    chosen, plans, space, before = found.chosen, found.plans, found.space, found.before
     sections = []
     for plan in chosen:
         command = plan.candidate.command
+        axes = Axes(smallest=0.1)
         items = [_room_chart(plan, limits),
-                 line_chart([_held(command.t, command.v)], "t [s]", "v [m/s]", "speed", smallest=0.1),
-                 line_chart([_held(command.t, command.omega)], "t [s]", "omega [rad/s]", "yaw rate", smallest=0.1)]
+                 line_chart([_held(command.t, command.v)], "t [s]", "v [m/s]", "speed", axes),
+                 line_chart([_held(command.t, command.omega)], "t [s]", "omega [rad/s]", "yaw rate", axes)]
         x, y, yaw = plan.start
         sections.append(Section(plan.candidate.name, charts(items) + paragraph(
             f"Start {x:.2f} m, {y:.2f} m from the lower left corner, heading {np.rad2deg(yaw):.0f} degrees. The path "
@@ -107,7 +105,7 @@ def _room_chart(plan: Plan, limits: Limits) -> str:
     inner = Line(np.array([margin, length - margin, length - margin, margin, margin]),
                  np.array([margin, margin, width - margin, width - margin, margin]), colour=PALETTE[7], dash="4 3")
     return line_chart([outer, inner, Line(x, y), Line(x[:1], y[:1], colour=PALETTE[3], markers=True)], "x [m]", "y [m]",
-                      "path in the room (dot: start)", equal=True)
+                      "path in the room (dot: start)", Axes(equal=True))
 
 
 def _held(t: np.ndarray, values: np.ndarray) -> Line:

@@ -12,7 +12,7 @@ from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
 from whill_mjx.io.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
-from whill_mjx.io.svg import COLOURS, PALETTE, Line, bar_chart, interval_bar, line_chart, replay_line
+from whill_mjx.io.svg import COLOURS, PALETTE, Axes, Line, bar_chart, interval_bar, line_chart, replay_line
 
 REPLAYS = ("ideal", "initial", "fitted")
 REPLAY_WORDS = {"ideal": "a vehicle that follows its commands at once", "initial": "the model before the fit",
@@ -232,7 +232,7 @@ def profiles(report: dict[str, Any]) -> str:
             parabola = one["threshold"] * ((fine - about["value"]) / np.maximum(half, 1e-12)) ** 2
             lines.append(Line(fine, np.where(parabola <= top, parabola, np.nan), "curvature", PALETTE[1], "5 3"))
         items.append(line_chart(lines, f"{one['name']} [{one['unit']}]", "2 x loss of log likelihood",
-                                band=(0.0, one["threshold"]), width=340, height=250))
+                                axes=Axes(band=(0.0, one["threshold"]), width=340, height=250)))
         rows.append([one["name"], one["unit"], about["value"], *one["interval"], low, high, one["remark"]])
     confidence = report["parameters"][0]["confidence"]
     header = ["parameter", "unit", "fitted", f"profile, {confidence:.0%} from", "to", "curvature from", "to", "remark"]
@@ -243,7 +243,7 @@ def profiles(report: dict[str, Any]) -> str:
 def trajectories(drawn: Sequence[TrialSeries]) -> str:
     """Paths of the outside pose, or of the odometry without one."""
     items = [line_chart([replay_line(values[:, 0], values[:, 1], name) for name, values in channel.values.items()],
-                        "x [m]", "y [m]", _label(trial), equal=True, smallest=SMALLEST)
+                        "x [m]", "y [m]", _label(trial), Axes(equal=True, smallest=SMALLEST))
              for trial in drawn if (channel := _position_channel(trial)) is not None]
     return _replay_legend() + charts(items, "Measured and replayed paths; all replays start at the measured start "
                                             "pose. Held-out trials first.")
@@ -252,7 +252,7 @@ def trajectories(drawn: Sequence[TrialSeries]) -> str:
 def yaws(drawn: Sequence[TrialSeries]) -> str:
     """Yaw over time of the same trials."""
     items = [line_chart([replay_line(channel.t, values[:, 2], name) for name, values in channel.values.items()],
-                        "t [s]", "yaw [rad]", _label(trial), smallest=0.05)
+                        "t [s]", "yaw [rad]", _label(trial), Axes(smallest=0.05))
              for trial in drawn if (channel := _position_channel(trial)) is not None]
     return _replay_legend() + charts(items)
 
@@ -275,7 +275,7 @@ def residuals(series: Sequence[TrialSeries], drawn: Sequence[TrialSeries]) -> st
             lines = [Line(one.t, error[:, column], "", PALETTE[k % len(PALETTE)], width=1.0)
                      for k, (one, error) in enumerate(found) if np.isfinite(error[:, column]).any()]
             if lines:
-                items.append(line_chart(lines, "t [s]", name, f"residual {name}", smallest=1e-4))
+                items.append(line_chart(lines, "t [s]", name, f"residual {name}", Axes(smallest=1e-4)))
         parts += [legend([(_label(trial), PALETTE[k % len(PALETTE)]) for k, trial in enumerate(mine)]), charts(items),
                   heading(f"{CHANNEL_NAMES[channel].capitalize()}: autocorrelation of the residual about zero"),
                   legend([("training trials", PALETTE[0]), ("held-out trials", PALETTE[1])]),
@@ -296,8 +296,8 @@ def _autocorrelations(series: Sequence[TrialSeries], channel: str) -> list[str]:
                 samples = max(samples, count)
         if lines:
             bound = 1.96 / np.sqrt(samples)
-            items.append(line_chart(lines, "lag [s]", "autocorrelation", name, band=(-bound, bound), width=280,
-                                    height=200))
+            items.append(line_chart(lines, "lag [s]", "autocorrelation", name,
+                                    Axes(band=(-bound, bound), width=280, height=200)))
     return items
 
 
@@ -384,7 +384,7 @@ def search(report: dict[str, Any]) -> str:
         near = sum(1 for cost in costs if cost < 1.02 * min(costs))
         rows.append(["starts within 2% of the best", f"{near} of {len(costs)}"])
     items = [line_chart([Line(np.array(one["values"], float), np.array(one["cost"], float), markers=True)],
-                        f"{one['name']} [s]", "cost", "delay profile", width=320, height=220)
+                        f"{one['name']} [s]", "cost", "delay profile", Axes(width=320, height=220))
              for one in about.get("delay_profiles") or []]
     scale = table(["channel", "noise scale"], [[name, value] for name, value in report["noise"]["scale"].items()])
     return table(["", ""], rows) + (charts(items) if items else "") + heading("Noise scales") + scale

@@ -22,7 +22,7 @@ from sysid.pages.loop_words import (
     vehicles,
 )
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table
-from whill_mjx.io.svg import PALETTE, Line, bar_chart, line_chart
+from whill_mjx.io.svg import PALETTE, Axes, Line, bar_chart, line_chart
 from whill_mjx.logs.dataset import write_text
 
 METRIC_WORDS = {"trajectory": "position", "yaw": "heading", "velocity": "speed", "angular_velocity": "turning rate"}
@@ -152,7 +152,7 @@ def next_drive(proposal: dict[str, Any]) -> str:
             line_chart([Line(held, np.repeat(command.v, 2)[:-1], "v [m/s]"),
                         Line(held, np.repeat(command.omega, 2)[:-1], "omega [rad/s]", PALETTE[1])], "t [s]", "command"),
             line_chart([Line(x, y), Line(x[:1], y[:1], colour=PALETTE[3], markers=True)], "x [m]", "y [m]",
-                       "ideal path in the room (dot: start)", equal=True)]))
+                       "ideal path in the room (dot: start)", Axes(equal=True))]))
     return "".join(parts)
 
 

@@ -16,7 +16,7 @@ from sysid.pages.report import write_report
 from sysid.pages.series import TrialSeries, save
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 from whill_mjx.io.html import Cell, Section, charts, html_page, legend, paragraph, png, table
-from whill_mjx.io.svg import COLOURS, line_chart, replay_line
+from whill_mjx.io.svg import COLOURS, Axes, line_chart, replay_line
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
 
@@ -154,9 +154,9 @@ def sections(content: dict[str, Any], series: Sequence[TrialSeries], figures: Se
         replays = {name: channel_of.values[name] for name in ("measured", "initial", "fitted")}
         title = trial.name + (" (held out)" if trial.held_out else "")
         paths.append(line_chart([replay_line(one[:, 0], one[:, 1], name) for name, one in replays.items()], "x [m]",
-                                "y [m]", title, equal=True, smallest=0.3))
+                                "y [m]", title, Axes(equal=True, smallest=0.3)))
         yaws.append(line_chart([replay_line(channel_of.t, one[:, 2], name) for name, one in replays.items()], "t [s]",
-                               "yaw [rad]", title, smallest=0.05))
+                               "yaw [rad]", title, Axes(smallest=0.05)))
     key = legend([(name, COLOURS[name]) for name in ("measured", "initial", "fitted")])
     return [Section("Table", "".join(parts)), Section("Parameters", values + paragraph(
         "The paper's values are of another vehicle; they stand here for orientation.", "dim")),

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -200,17 +200,23 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
     return results
 
 
-def path_of(
-    plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int = 0, speeds: jax.Array | None = None,
-    few: bool = False, gyro: bool = False,
-) -> jax.Array:
+class Commanded(NamedTuple):
+    """One drive that is to be replayed."""
+
+    command: jax.Array
+    """(R, K, 2) in force in each of K physics steps between records [m/s, rad/s]."""
+    start: jax.Array
+    """(5,) x, y, yaw, v, omega."""
+    warm_up: int = 0
+    """Physics steps at the start's speeds before it."""
+    speeds: jax.Array | None = None
+    """(W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`)."""
+
+
+def path_of(plant: Plant, params: Any, commanded: Commanded, few: bool = False, gyro: bool = False) -> jax.Array:
     """States (R + 1, 9) at the records, as `Plant.observe` gives them, of one drive; with a gyro (R + 1, 10).
 
     Args:
-        command: (R, K, 2) in force in each of K physics steps between records [m/s, rad/s].
-        start: (5,) x, y, yaw, v, omega.
-        warm_up: physics steps at the start's speeds before it.
-        speeds: (W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`).
         few: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
         gyro: whether the last column is what a gyro turned [rad].
     """
@@ -218,35 +224,9 @@ def path_of(
     params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "reference"):  # the start is that of a tracked point
-            start = effect.reference(start)
-    params, delay = delay_apart(params)
-
-    in_one = as_one_function if few and plant.arithmetic else lambda function: function
-
-    def after(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
-        state = _advance(plant, params, state, commands)
-        return state, plant.observe(state)
-
-    def drive(start: jax.Array, command: jax.Array) -> jax.Array:
-        state, before = plant.place(params, start), None
-        if warm_up:
-            state, before = _settle(plant, params, state, start[3:], warm_up, command.shape[1])
-            state = plant.move(state, start)
-        command = delayed(delay, command, plant.dt, before)
-        if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
-            later = in_one(partial(jax.lax.scan, after))(state, command)[1]
-        else:
-            later = plant.record(params, state, command)
-        return jnp.concatenate([plant.observe(state)[None], later])
-
-    gap = plant.dt * command.shape[1]
-    if speeds is None:
-        path = drive(start, command)
-    else:
-        begin = ((POSE, start[:3]), (slice(3, 6), jnp.zeros_like(start[:3])))
-        path = pieces.record(drive, command, start, speeds, round(pieces.OVERLAP / gap), begin)
-        path = path.at[-1, 8].set(path[:, 8].max())
-    turns = jax.lax.stop_gradient(_turns(start[2] - path[0, 2]))
+            commanded = commanded._replace(start=effect.reference(commanded.start))
+    path, gap = _driven(plant, params, commanded, few), plant.dt * commanded.command.shape[1]
+    turns = jax.lax.stop_gradient(_turns(commanded.start[2] - path[0, 2]))
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
     if lag is not None and plant.frame:
@@ -265,6 +245,35 @@ def path_of(
     return jnp.concatenate([path, turned[:, None]], axis=1) if gyro else path
 
 
+def _driven(plant: Plant, params: Any, commanded: Commanded, few: bool) -> jax.Array:
+    """States (R + 1, 9) of the drive, before what sensors make of them."""
+    command, start, warm_up, speeds = commanded
+    params, delay = delay_apart(params)
+    in_one = as_one_function if few and plant.arithmetic else lambda function: function
+
+    def after(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
+        state = _advance(plant, params, state, commands)
+        return state, plant.observe(state)
+
+    def drive(start: jax.Array, command: jax.Array) -> jax.Array:
+        state, before = plant.place(params, start), None
+        if warm_up:
+            state, before = _settle(plant, params, state, start[3:], warm_up, command.shape[1])
+            state = plant.move(state, start)
+        command = delayed(delay, command, plant.dt, before)
+        if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
+            later = in_one(partial(jax.lax.scan, after))(state, command)[1]
+        else:
+            later = plant.record(params, state, command)
+        return jnp.concatenate([plant.observe(state)[None], later])
+
+    if speeds is None:
+        return drive(start, command)
+    begin, gap = ((POSE, start[:3]), (slice(3, 6), jnp.zeros_like(start[:3]))), plant.dt * command.shape[1]
+    path = pieces.record(drive, command, start, speeds, round(pieces.OVERLAP / gap), begin)
+    return path.at[-1, 8].set(path[:, 8].max())
+
+
 class PathReplay:
     """Compiled `path_of` for rows of a fixed number: each row is a parameter set on one trial of a batch.
 
@@ -273,7 +282,7 @@ class PathReplay:
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
         def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int, gyro: bool) -> jax.Array:
-            return path_of(plant, set_values(values), command, start, warm_up, few=rows <= IN_ONE, gyro=gyro)
+            return path_of(plant, set_values(values), Commanded(command, start, warm_up), rows <= IN_ONE, gyro)
 
         self.rows, self._compiled = rows, False
         self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None, None)), static_argnums=(3, 4))
@@ -304,7 +313,8 @@ class PathReplay:
 
 def simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
     """Replay one trial of a batch with one parameter set."""
-    path = path_of(plant, params, one.command, one.start, one.warm_up, one.speeds, few, one.gyro_index is not None)
+    commanded = Commanded(one.command, one.start, one.warm_up, one.speeds)
+    path = path_of(plant, params, commanded, few, one.gyro_index is not None)
 
     def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
         before, after = path[index, columns], path[index + 1, columns]

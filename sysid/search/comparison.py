@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -63,37 +63,41 @@ class Recorder:
         self._spent += time.perf_counter() - now
 
 
-def trace(
-    problem: Problem, judge: Judge, track: float, method: str, seed: int, *, evaluations: int = 256,
-    iterations: int = 20, start_count: int = 4, progress: Progress | None = None,
-) -> Trace:
-    """Run one search and follow its best point.
+@dataclass(frozen=True)
+class Effort:
+    """How long searches go on."""
 
-    Args:
-        track: of the vehicle [m] (`sysid.search.starts`).
-        evaluations: of the global searches.
-        iterations: of the gradient searches.
-        start_count: starts of the gradient searches: the initial values, and random ones.
-    """
+    evaluations: int = 256
+    """Of the global searches."""
+    iterations: int = 20
+    """Of the gradient searches."""
+    starts: int = 4
+    """Of the gradient searches: the initial values, and random ones."""
+
+
+def trace(
+    problem: Problem, judge: Judge, method: str, seed: int, effort: Effort, progress: Progress | None = None
+) -> Trace:
+    """Run one search and follow its best point."""
     if method not in METHODS:
         raise ValueError(f"no search {method!r} (known: {', '.join(METHODS)}).")
     objective, space = problem.objective, problem.space
-    _compile(objective, method, start_count)
+    _compile(objective, method, effort.starts)
     recorder = Recorder(objective.replay, objective)
     watched = replace(objective, replay=recorder)
-    points = least_squares.random_starts(space, start_count, seed)
+    points = least_squares.random_starts(space, effort.starts, seed)
     if method in BATCH:
-        tpe.fit(watched, space, evaluations=evaluations, seed=seed, cost="weighted", method=method, progress=progress)
+        tpe.fit(watched, space, tpe.GlobalSearch(effort.evaluations, seed, method=method), progress=progress)
     else:
         if method == "both":  # as a fit does it: from the initial values, and from the best of a short global search
-            short = min(evaluations, FitConfig().trials)
-            scan = tpe.fit(watched, space, evaluations=short, seed=seed, cost="weighted", best=1, progress=progress)
+            short = tpe.GlobalSearch(min(effort.evaluations, FitConfig().trials), seed, best=1)
+            scan = tpe.fit(watched, space, short, progress=progress)
             points = np.concatenate([points[:1], scan.starts])
         if method == "features":
-            points = starts.draw(watched, range(start_count), track, seed)
-            points = starts.fit(watched, points, track, iterations, progress).u[None]
+            points = starts.draw(watched, range(effort.starts), judge.track, seed)
+            points = starts.fit(watched, points, judge.track, effort.iterations, progress).u[None]
         # As a fit does it, delays included; squares for all, so that the costs are of one kind.
-        gradient_search(watched, space, points, iterations, FitConfig(robust=False), Stages(progress, 2))
+        gradient_search(watched, space, points, effort.iterations, FitConfig(robust=False), Stages(progress, 2))
     kept = list(recorder.best)
     kept.append((recorder.evaluations, recorder.seconds, *kept[-1][2:]))
     count, seconds, cost, u = (np.array(column) for column in zip(*kept, strict=True))
@@ -104,7 +108,7 @@ class Judge:
     """Mean position RMSE on the held-out trials; compiled once for all searches."""
 
     def __init__(self, problem: Problem, log: Log):
-        self._space, self._trials = problem.space, log.held_out
+        self._space, self._trials, self.track = problem.space, log.held_out, log.spec.track
         if self._trials:
             self._replay, _ = make_replay(problem.plant, problem.params, problem.space, self._trials)
 

@@ -16,7 +16,7 @@ from sysid.errors.prior import Prior, bounds_alone, make_prior
 from sysid.errors.robust import robust_cost
 from sysid.errors.space import Space, make_space, searched
 from sysid.intervals import uncertainty
-from sysid.intervals.profiles import Profile, check_names, profile
+from sysid.intervals.profiles import Minimum, Profile, check_names, profile
 from sysid.logs import odometry_frames
 from sysid.logs.log import of_file
 from sysid.logs.records import Log, Prediction, Trial
@@ -51,6 +51,7 @@ from sysid.search.settings import (
     FitConfig,
 )
 from sysid.search.stated import chosen_sizes
+from sysid.search.studies import StudyPlace
 from sysid.search.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
@@ -131,7 +132,7 @@ def fit_log(
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
     known = uncertainty.estimate(chosen, u, robust=robust)
-    traced = profile(chosen, u, known, wanted, robust=config.robust, progress=progress) if wanted else []
+    traced = profile(chosen, Minimum(u, known, config.robust), wanted, progress=progress) if wanted else []
     if config.calibrate and not config.all_sizes and config.vehicle is None and config.method not in GLOBAL:
         if progress is not None:
             progress(0, "sizes: stated or free")
@@ -162,9 +163,10 @@ def _first_points(
         problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in objective.trials),
                    "channels": config.channels, "model": config.preset if given.model is None else given.model.name,
                    "step": f"{given.plant.dt:g}"}
-        scan = tpe.fit(objective, space, evaluations=evaluations, seed=config.seed, cost=cost, best=count - 1,
-                       progress=stages.begin("global search"), storage=config.storage, study=config.study,
-                       problem=problem, method="cmaes" if config.method == "cmaes" else "tpe")
+        search = tpe.GlobalSearch(evaluations, config.seed, cost, "cmaes" if config.method == "cmaes" else "tpe",
+                                  count - 1)
+        scan = tpe.fit(objective, space, search, StudyPlace(config.storage, config.study, problem),
+                       stages.begin("global search"))
         return scan, None, np.concatenate([points[:1], scan.starts])[:count]
     if config.method == "features":
         first = stages.begin("features of motion")

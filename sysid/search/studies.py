@@ -17,6 +17,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import unquote, unquote_plus
 
@@ -112,20 +113,28 @@ def _masked(message: str, storage: str) -> str:
     return message
 
 
+@dataclass(frozen=True)
+class StudyPlace:
+    """Where a study is kept, and what it is about."""
+
+    storage: Any = None
+    """Of `open_storage`, or what it opens; None keeps the study in memory."""
+    name: str = "fit"
+    problem: Mapping[str, str] = field(default_factory=dict)
+    """What is searched, as short texts; a study of another problem is refused."""
+
+
 class SharedStudy:
     """One process's part in a study."""
 
     def __init__(
-        self, names: tuple[str, ...], initial: np.ndarray, *, method: str = "tpe", seed: int = 0, storage: Any = None,
-        study: str = "fit", problem: Mapping[str, str] | None = None,
+        self, names: tuple[str, ...], initial: np.ndarray, place: StudyPlace, *, method: str = "tpe", seed: int = 0
     ):
         """Create or join the study.
 
         Args:
             names: of the parameters, in unit coordinates.
             initial: (P,) where the search begins.
-            storage: of `open_storage`.
-            problem: what is searched, as short texts; a study of another problem is refused.
 
         Raises:
             ValueError: the study is of another problem, or the method is unknown.
@@ -134,13 +143,14 @@ class SharedStudy:
 
         if method not in BATCH:
             raise ValueError(f"method {method!r} is no global search (known: {', '.join(BATCH)}).")
+        storage, study = open_storage(place.storage), place.name
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self._optuna, self._names, self._storage = optuna, names, storage
         self._worker = uuid.uuid4().hex[:12]
         self.batch = BATCH[method]
         self._study = optuna.create_study(study_name=study if storage is not None else None, storage=storage,
                                           direction="minimize", load_if_exists=storage is not None)
-        wanted = {"parameters": ", ".join(names), "method": method, **(problem or {})}
+        wanted = {"parameters": ", ".join(names), "method": method, **place.problem}
         for key, value in wanted.items():
             known = self._study.user_attrs.get(f"problem: {key}")
             if known is not None and known != value:

@@ -126,7 +126,11 @@ def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
         raise ValueError(f"log {log.name!r} has neither odometry nor an outside pose. Record one of them.")
+    mine = {trial.name for trial in log.trials}
     for other in references:
+        if other.sha256 == log.sha256 and mine & {trial.name for trial in other.training}:
+            raise ValueError(f"reference {other.name!r} has the drives in question themselves. Give drives of other "
+                             "days.")
         if not other.training:
             raise ValueError(f"reference {other.name!r} has no training trial. Leave it out, or take some out of "
                              "held_out.")

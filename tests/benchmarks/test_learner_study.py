@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from types import SimpleNamespace
 from unittest import mock
 
@@ -67,7 +66,7 @@ def test_the_fused_kernel_gives_the_states_of_the_scan():
     params, start, args = sequences(config, 16)
     params = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.PRNGKey(x.size), x.shape), params)
     scanned = rssm.observe(config, params, start, *args)
-    alone = partial(learner_fused.fused_scan, learner_fused.Layout(alone=True))
+    alone = learner_fused.fused_scan(learner_fused.Layout(alone=True))
     with mock.patch.object(rssm, "scan_products", alone):
         fused = rssm.observe(config, params, start, *args)
     for one, other in zip(jax.tree.leaves(scanned), jax.tree.leaves(fused), strict=True):
@@ -77,7 +76,7 @@ def test_the_fused_kernel_gives_the_states_of_the_scan():
 def test_widths_that_the_fused_kernel_cannot_have_are_refused():
     config = preset("cpu", deter=48, hidden=16, stoch=2, classes=16, blocks=2, batch_size=16)
     params, start, args = sequences(config, 16)
-    with mock.patch.object(rssm, "scan_products", partial(learner_fused.fused_scan, learner_fused.Layout(alone=True))):
+    with mock.patch.object(rssm, "scan_products", learner_fused.fused_scan(learner_fused.Layout(alone=True))):
         with pytest.raises(ValueError, match="deter is 48"):
             rssm.observe(config, params, start, *args)
 

@@ -28,7 +28,7 @@ def folder(tmp_path_factory):
     """Two checkpoints of ten and twenty steps."""
     path = tmp_path_factory.mktemp("run") / "checkpoints"
     for steps in (10, 20):
-        checkpoint.save(path, state(steps), Config(), steps)
+        checkpoint.save(path, state(steps), Config(), checkpoint.Moment(steps))
     checkpoint.restore(path, state(0), Config())  # what orbax does only once is no cost of a file
     return path
 

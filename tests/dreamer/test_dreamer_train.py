@@ -166,7 +166,7 @@ def saved(tmp_path):
     """A folder with two small checkpoints and the function that reads them."""
     state = {"a": np.arange(5000.0), "key": jax.random.key(3), "empty": np.zeros((0, 2))}
     for steps in (100, 200, 300):
-        checkpoint.save(tmp_path, {**state, "a": state["a"] + steps}, CONFIG, steps)
+        checkpoint.save(tmp_path, {**state, "a": state["a"] + steps}, CONFIG, checkpoint.Moment(steps))
     return tmp_path, lambda config=CONFIG, state=state: checkpoint.restore(tmp_path, state, config)
 
 
@@ -214,7 +214,7 @@ def test_a_full_disk_is_an_os_error_that_names_the_checkpoint_and_the_older_ones
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
         with pytest.raises(OSError, match="File too large.*000000000400"):
-            checkpoint.save(folder, {"a": np.random.default_rng(0).normal(size=5000)}, CONFIG, 400)
+            checkpoint.save(folder, {"a": np.random.default_rng(0).normal(size=5000)}, CONFIG, checkpoint.Moment(400))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert sorted(path.name for path in folder.iterdir()) == ["000000000200", "000000000300"]
@@ -224,7 +224,7 @@ def test_a_full_disk_is_an_os_error_that_names_the_checkpoint_and_the_older_ones
 def test_what_a_killed_process_left_of_a_checkpoint_is_removed_by_the_next(saved):
     folder, _ = saved
     (folder / ".unfinished-000000000400" / "state").mkdir(parents=True)
-    checkpoint.save(folder, {"a": np.zeros(3)}, CONFIG, 500)
+    checkpoint.save(folder, {"a": np.zeros(3)}, CONFIG, checkpoint.Moment(500))
     assert sorted(path.name for path in folder.iterdir()) == ["000000000300", "000000000500"]
 
 
@@ -238,7 +238,7 @@ def test_a_checkpoint_has_the_rights_that_the_users_umask_lets_it_have(saved):
 
 @pytest.mark.quick
 def test_another_seed_or_a_second_process_in_the_folder_of_a_run_is_refused(tmp_path):
-    checkpoint.save(tmp_path / "checkpoints", {"a": np.zeros(3)}, CONFIG, 100)
+    checkpoint.save(tmp_path / "checkpoints", {"a": np.zeros(3)}, CONFIG, checkpoint.Moment(100))
     (tmp_path / "config.json").write_text(json.dumps({"seed": 0}))
     with pytest.raises(ValueError, match="begun with seed 0, not 1. Give that seed, or another folder"):
         train(ENV, CONFIG, tmp_path, 400, 1, QUIET)

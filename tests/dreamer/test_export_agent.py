@@ -37,7 +37,7 @@ def exported(request, tmp_path_factory):
     config, shape, action = CASES[request.param]
     params = params_of(config, shape, action)
     path = tmp_path_factory.mktemp("policy") / request.param
-    return request.param, export_agent(path, config, params, shape, action, task="toy", check_steps=50), params
+    return request.param, export_agent(path, config, params, shape, action, task="toy"), params
 
 
 def test_an_exported_agent_acts_in_onnxruntime_as_it_does_in_jax(exported):
@@ -104,7 +104,7 @@ def test_a_network_that_prefers_its_classes_otherwise_is_refused(tmp_path, monke
     original = dreamer.export.to_onnx
     monkeypatch.setattr(dreamer.export, "to_onnx", warped)
     with pytest.raises(ValueError, match="a step of it differs from JAX"):
-        export_agent(tmp_path / "p", config, params, shape, action, check_steps=5)
+        export_agent(tmp_path / "p", config, params, shape, action)
     assert not list(Path(tmp_path).iterdir())
 
 

@@ -38,7 +38,7 @@ def observe():
     @jax.jit
     def run(params, start, actions, obs, is_first, uniform):
         tokens = image.encode(CONFIG, params["enc"], obs)
-        return rssm.observe(CONFIG, params["dyn"], start, actions, tokens, is_first, uniform)
+        return rssm.observe(CONFIG, params["dyn"], start, rssm.Sequences(actions, tokens, is_first, uniform))
 
     return run
 
@@ -65,7 +65,7 @@ def test_acting_infers_the_same_latents_as_training(params, sequence, observe):
     is_first = jnp.zeros((T, B), bool).at[0].set(True).at[5, 1].set(True)
     keys = jax.random.split(KEY, T)
     carry = agent.init_carry(CONFIG, B, A)
-    act = jax.jit(lambda carry, obs, first, key: agent.act(CONFIG, params, carry, obs, first, key))
+    act = jax.jit(lambda carry, obs, first, key: agent.act(CONFIG, params, carry, obs, first, agent.Choice(key)))
     acted, actions = [], [jnp.zeros((B, A))]
     for t in range(T):
         carry, action = act(carry, obs[t], is_first[t], keys[t])
@@ -79,7 +79,7 @@ def test_acting_infers_the_same_latents_as_training(params, sequence, observe):
 
 def test_the_vehicle_step_equals_acting_in_mode_from_a_zero_carry(params, sequence):
     obs, _, _ = sequence
-    act = jax.jit(lambda carry, obs, first: agent.act(CONFIG, params, carry, obs, first, None, mode=True))
+    act = jax.jit(lambda carry, obs, first: agent.act(CONFIG, params, carry, obs, first, agent.Choice()))
     step = jax.jit(lambda carry, obs: agent.policy_step(CONFIG, params, carry, obs))
     batched, single = agent.init_carry(CONFIG, B, A), agent.policy_carry(CONFIG, A)
     for t in range(3):
@@ -109,7 +109,7 @@ def test_gradients_of_the_fast_scan_equal_those_of_the_plain_recurrence(params, 
         return total
 
     def fast(dyn, tokens):
-        latent, probs = rssm.observe(CONFIG, dyn, garbage_start(), actions, tokens, is_first, uniform)
+        latent, probs = rssm.observe(CONFIG, dyn, garbage_start(), rssm.Sequences(actions, tokens, is_first, uniform))
         return jnp.sum(weigh * latent.features()) + jnp.sum(jnp.square(probs))
 
     expected = jax.jit(jax.value_and_grad(plain, argnums=(0, 1)))(params["dyn"], tokens)

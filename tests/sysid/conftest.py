@@ -63,10 +63,11 @@ def unicycle_objective(trials, space: Space = UNICYCLE_SPACE) -> Objective:
 def unicycle_log(tmp_path_factory):
     """Log of the kinematic vehicle at TRUTH, with sensor noise."""
     from sysid.logs.log import load_log
-    from sysid.logs.synthetic import write_dataset
+    from sysid.logs.synthetic import Schedule, write_dataset
 
     folder = tmp_path_factory.mktemp("unicycle") / "log"
-    write_dataset(folder, WHILL_CR, jnp.asarray(TRUTH), replicates=2, scenario=SHORT, plant=unicycle_plant(), seed=3)
+    write_dataset(folder, WHILL_CR, jnp.asarray(TRUTH), Schedule(replicates=2, scenario=SHORT, seed=3),
+                  plant=unicycle_plant())
     return load_log(folder)
 
 

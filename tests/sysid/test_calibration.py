@@ -18,7 +18,7 @@ from sysid.errors.space import make_space
 from sysid.intervals.uncertainty import Estimate, estimate
 from sysid.logs.log import load_log, make_trial
 from sysid.logs.records import Log, OdometryStream, PoseStream
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.reference import ASSUMED_SPREAD, assumed_spread
 from sysid.pages.calibration import UNKNOWN as NOT_TOLD
 from sysid.pages.calibration import calibration_notes
@@ -29,7 +29,7 @@ from sysid.replay.on_host import HostReplay
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import drive_entries
-from sysid.replay.rollout import Replay, make_batch, path_of, vehicle_plant
+from sysid.replay.rollout import Commanded, Replay, make_batch, path_of, vehicle_plant
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FitConfig
@@ -102,8 +102,9 @@ def planted(tmp_path_factory) -> Log:
     wrong = {"wheel_radius_difference.common": 0.03, "track_width.error": -0.05, "odometry_scale.linear": 0.98,
              "odometry_scale.angular": 0.97}
     params = set_values(params, list(wrong), jnp.array(list(wrong.values())))
-    folder = write_dataset(tmp_path_factory.mktemp("planted") / "log", spec, params, replicates=1, seed=2,
-                           scenario=Scenario(v=0.4, omega=1.2, length=3.0), manoeuvres=("turn", "s_curve"),
+    folder = write_dataset(tmp_path_factory.mktemp("planted") / "log", spec, params,
+                           Schedule(replicates=1, seed=2, scenario=Scenario(v=0.4, omega=1.2, length=3.0),
+                                    manoeuvres=("turn", "s_curve")),
                            plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)))
     log, trials = load_log(folder), []
     for trial in log.trials:
@@ -410,7 +411,7 @@ def test_a_start_is_that_of_the_tracked_point_also_where_the_room_matters(small_
     turned = set_values(params, ["pose_mount.x", "pose_mount.yaw"], jnp.array([0.1, 0.5]))
     start = jnp.array([1.0, 2.0, 0.3, 0.0, 0.0])
     command = jnp.zeros((30, 2, 2)).at[..., 0].set(0.2)
-    path = jax.jit(lambda command: path_of(plant, turned, command, start))(command)
+    path = jax.jit(lambda command: path_of(plant, turned, Commanded(command, start)))(command)
     np.testing.assert_allclose(path[0, :3], start[:3], atol=1e-4)
     moved = np.asarray(path[-1, :2] - path[0, :2])
     np.testing.assert_allclose(np.arctan2(moved[1], moved[0]), 0.3 - 0.5, atol=1e-3)

@@ -17,7 +17,7 @@ from sysid.follow_up.trust import advice, as_good_as_repeats, beside_still_base,
 from sysid.follow_up.unnamed import vehicle_of, with_start_angles
 from sysid.logs.log import load_log
 from sysid.logs.metrics import own_floor, score
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
 from sysid.missing.joint_fit import without_each
@@ -81,8 +81,9 @@ def drives(folder):
         spec, params = day(number)
         if name == "sloping":
             params = VehicleParams(params.body, (*params.effects, make_effect("slope", along_x=0.03)))
-        write_dataset(folder / name, spec, params, manoeuvres=(*DRIVES, "figure_eight"), replicates=3,
-                      scenario=scenario, seed=number, plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)))
+        write_dataset(folder / name, spec, params,
+                      Schedule(manoeuvres=(*DRIVES, "figure_eight"), replicates=3, scenario=scenario, seed=number),
+                      plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)))
         logs[name] = load_log(folder / name)
     return logs
 

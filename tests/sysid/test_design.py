@@ -11,22 +11,18 @@ import sysid.design as design_command
 from sysid.design import DesignConfig, main
 from sysid.errors.space import Space
 from sysid.intervals.design import (
-    INFLATION,
-    best_splitting_manoeuvre,
+    Subject,
     candidate_objective,
     identifiable_subspace,
     information,
     prior_information,
     propose,
     rank,
-    separation,
-    splitting_scores,
 )
 from sysid.intervals.uncertainty import PRIOR_SD
 from sysid.logs.log import read_csv
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, make_command, placement
 from sysid.logs.metrics import ideal_replay
-from sysid.logs.records import Command
 from sysid.replay.records import Plant
 from whill_mjx.vehicle.parameters import get_values
 from whill_mjx.vehicle.specs import WHILL_CR
@@ -125,17 +121,6 @@ def test_intervals_become_information_in_unit_coordinates():
     assert prior[1, 1] == pytest.approx(PRIOR_SD**-2)
 
 
-@quick
-def test_separation_is_what_neither_base_nor_rival_explains():
-    e = np.eye(5) * np.sqrt(INFLATION)
-    nothing = np.zeros((5, 0))
-    assert separation(e[0], e[1], nothing) == pytest.approx(1.0)
-    assert separation(e[0], e[0] + e[1], nothing) == pytest.approx(1 / np.sqrt(2))
-    assert separation(e[0], -3 * e[0], nothing) == pytest.approx(0.0, abs=1e-9)
-    assert separation(e[0] + e[2], e[1], e[:, [0]]) == pytest.approx(1.0)
-    assert separation(e[0], np.zeros(5), np.zeros((5, 2))) == pytest.approx(1.0)
-
-
 @pytest.fixture(scope="module")
 def unicycle_information():
     names = ("straight", "turn", "circle")
@@ -157,35 +142,6 @@ def test_what_only_an_outside_pose_tells_is_blind_to_odometry():
                                     candidates("circle", seconds=3.0), channels="odometry")
     (found,) = information(objective, UNICYCLE_SPACE.initial)
     assert found[2, 2] == pytest.approx(0.0, abs=1e-3) and found[0, 0] > 1
-
-
-def dead_zone_plant():
-    """The kinematic vehicle with a gain on its commands and a dead zone of them: parameters (gain, width, lag)."""
-    base = unicycle_plant()
-
-    def substep(params, state, command):
-        gain, width, lag = params
-        told = gain * jnp.sign(command) * jnp.maximum(jnp.abs(command) - width, 0.0)
-        return base.substep(jnp.stack([lag, lag, jnp.ones_like(lag)]), state, told)
-
-    return Plant(base.place, substep, base.observe, base.dt, base.move)
-
-
-@quick
-def test_a_dead_zone_is_split_from_a_gain_by_the_manoeuvre_that_changes_its_size():
-    ladder = make_command("step_ladder", 0.5, 0.8, 12.0)
-    constant = Command(ladder.t, np.where((ladder.t > 1) & (ladder.t < 10), 0.5, 0.0), 0 * ladder.t)
-    found = [Candidate("constant", constant), Candidate("ladder", ladder)]
-    lag = Space(("lag",), np.array([0.05]), np.array([1.0]), np.array([0.2]), np.array([True]))
-
-    def apply(values):
-        return jnp.array([1.0, 0.0, values[0]])
-
-    arguments = (WHILL_CR, None, lag, jnp.array([1.0, 0.03, 0.2]), jnp.array([0.94, 0.0, 0.2]), found)
-    scores = splitting_scores(*arguments, plant=dead_zone_plant(), apply=apply)
-    name, command, score = best_splitting_manoeuvre(*arguments, plant=dead_zone_plant(), apply=apply)
-    assert name == "ladder" and command is ladder and score == pytest.approx(scores[1])
-    assert scores[0] < 0.1 * scores[1] and scores[1] > 3
 
 
 def stand_in(spec, config):
@@ -234,7 +190,9 @@ def test_an_unknown_vehicle_ends_with_one_line(monkeypatch):
 @quick
 def test_a_room_that_every_drive_leaves_is_refused(monkeypatch):
     monkeypatch.setattr("sysid.intervals.design.driven_paths", lambda objective: [np.array([[0, 0], [99, 99.0]])] * 2)
+    monkeypatch.setattr("sysid.intervals.design.library", lambda limits: candidates("straight", "turn", seconds=2.0))
+    monkeypatch.setattr("sysid.intervals.design.vehicle_plant", lambda *a: unicycle_plant())
     monkeypatch.setattr("sysid.intervals.design.make_space", lambda *a: UNICYCLE_SPACE)
     monkeypatch.setattr("sysid.intervals.design.set_values", lambda params, names, values: values)
     with pytest.raises(ValueError, match="leaves 8 x 8 m in every manoeuvre"):
-        propose(WHILL_CR, None, candidates=candidates("straight", "turn", seconds=2.0), plant=unicycle_plant())
+        propose(Subject(WHILL_CR, None))

@@ -17,7 +17,7 @@ from outside_effect import HeadingDrift
 
 from sysid.follow_up.next_manoeuvre import sensor_for
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.catalogue import falsifiers, hypotheses
 from sysid.pages.loop_report import make_report, write_run
 from sysid.replay.models import with_effects
@@ -77,8 +77,9 @@ def logs(registered, tmp_path_factory):
         usual = np.asarray(get_values(params, names))
         day = set_values(params, names, usual * (1 + 0.02 * np.random.default_rng(number).standard_normal(3)))
         truth = dataclasses.replace(day, effects=(*day.effects, make_effect("heading_drift", rate=rate)))
-        write_dataset(folder / str(number), spec, truth, manoeuvres=("straight", "circle", "s_curve", "figure_eight"),
-                      replicates=3, scenario=Scenario(length=4.0), seed=number,
+        write_dataset(folder / str(number), spec, truth,
+                      Schedule(manoeuvres=("straight", "circle", "s_curve", "figure_eight"), replicates=3,
+                               scenario=Scenario(length=4.0), seed=number),
                       plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)))
         found.append(load_log(folder / str(number)))
     return found

@@ -10,7 +10,7 @@ import pytest
 
 import sysid.fit as fit_module
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import REPLAYS
 from sysid.replay.rollout import vehicle_plant
@@ -35,8 +35,9 @@ def planted(tmp_path_factory):
     initial = preset_params(WHILL_CR, "paper")
     truth = set_values(initial, tuple(PLANTED), np.array(list(PLANTED.values()), np.float32))
     plant = vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.01))  # the step is part of the model
-    write_dataset(folder / "log", WHILL_CR, truth, replicates=2, seed=5, noise=SensorNoise(), plant=plant,
-                  scenario=Scenario(v=0.5, omega=1.6, length=4.0))
+    write_dataset(folder / "log", WHILL_CR, truth,
+                  Schedule(replicates=2, seed=5, scenario=Scenario(v=0.5, omega=1.6, length=4.0)),
+                  noise=SensorNoise(), plant=plant)
     config = FitConfig(preset="paper", iterations=20, parameters=tuple(PLANTED), physics_dt=0.01)
     report = fit_dataset(folder / "log", folder / "run", config=config)
     return folder, report

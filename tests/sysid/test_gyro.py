@@ -14,7 +14,7 @@ from sysid.errors.pose_objective import estimate_noise
 from sysid.logs.gyro import with_sign
 from sysid.logs.log import load_log
 from sysid.logs.records import GyroStream, Log
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.replay.courses import CourseReplay
 from sysid.replay.models import function_model, set_parameters
 from sysid.replay.rollout import make_batch, predictions
@@ -55,9 +55,10 @@ def truth(model):
 def folder(model, truth, tmp_path_factory):
     """Drives of the model, seen from outside by a noisy pose."""
     path = tmp_path_factory.mktemp("gyro") / "log"
-    return write_dataset(path, WHILL_CR, truth, replicates=1, scenario=Scenario(v=0.5, omega=0.8, length=3.0), seed=3,
-                         manoeuvres=("straight", "s_curve", "figure_eight"), plant=model.plant,
-                         noise=SensorNoise(position=0.05, yaw=0.1))
+    return write_dataset(path, WHILL_CR, truth,
+                         Schedule(replicates=1, scenario=Scenario(v=0.5, omega=0.8, length=3.0), seed=3,
+                                  manoeuvres=("straight", "s_curve", "figure_eight")),
+                         plant=model.plant, noise=SensorNoise(position=0.05, yaw=0.1))
 
 
 @pytest.fixture(scope="module")

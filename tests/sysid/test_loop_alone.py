@@ -15,7 +15,7 @@ from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, 
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import no_wander
 from sysid.missing.signatures import manoeuvre_groups
-from sysid.replay.rollout import make_batch, path_of
+from sysid.replay.rollout import Commanded, make_batch, path_of
 from sysid.verdict import alone
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
 from sysid.verdict.found import Candidate, Effort
@@ -167,8 +167,8 @@ def test_a_replay_shows_the_pose_late_and_the_odometry_in_time():
                   substep=lambda params, state, command: state.at[0].add(0.025 * command[0]))
     command = jnp.zeros((80, 1, 2)).at[40:, 0, 0].set(2.0)  # at rest for 1 s, then 2 m/s
     start = jnp.zeros(5)
-    plain = path_of(plant, Cart(), command, start)
-    late = path_of(plant, Cart((make_effect("pose_delay", delay=0.3),)), command, start)
+    plain = path_of(plant, Cart(), Commanded(command, start))
+    late = path_of(plant, Cart((make_effect("pose_delay", delay=0.3),)), Commanded(command, start))
     np.testing.assert_allclose(late[12:, 0], plain[:-12, 0], atol=1e-5)
     np.testing.assert_array_equal(late[:, 3:], plain[:, 3:])
 

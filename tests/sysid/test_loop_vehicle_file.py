@@ -7,7 +7,7 @@ import pytest
 from sysid.errors.features import CHANNELS
 from sysid.errors.noise import Whitener
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_in_bins, load_fitted, statistics_of
 from sysid.replay.rollout import make_batch, predictions, simulate, vehicle_plant
@@ -32,7 +32,8 @@ def drive(folder, name, seed, gains, slope=0.0):
     params = set_values(CHAIR, list(NAMES), np.array([value * gains for value in values.values()]))
     effects = (make_effect("slope", along_x=slope),) if slope else ()
     write_dataset(folder / name, SPEC, VehicleParams(params.body, (*params.effects, *effects)),
-                  manoeuvres=("straight", "circle", "s_curve"), replicates=2, scenario=Scenario(length=4.0), seed=seed,
+                  Schedule(manoeuvres=("straight", "circle", "s_curve"), replicates=2,
+                           scenario=Scenario(length=4.0), seed=seed),
                   plant=vehicle_plant(SPEC, VehicleConfig(physics_dt=0.01)))
     return load_log(folder / name), params
 

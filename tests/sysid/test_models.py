@@ -20,7 +20,7 @@ from sysid import fit as fit_module
 from sysid.fit import Arguments
 from sysid.logs.log import make_trial
 from sysid.logs.records import Command, OdometryStream, PoseStream
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
@@ -101,8 +101,10 @@ def function_run(function_file, tmp_path_factory):
     folder = tmp_path_factory.mktemp("planted")
     model = load_model(str(function_file), WHILL_CR).with_effects(("command_delay",))
     truth = set_parameters(model.params, list(PLANTED), jnp.array(list(PLANTED.values())))
-    write_dataset(folder / "log", WHILL_CR, truth, replicates=2, scenario=Scenario(v=0.5, omega=0.8, length=3.0),
-                  seed=3, manoeuvres=("straight", "s_curve", "figure_eight"), plant=model.plant)
+    write_dataset(folder / "log", WHILL_CR, truth,
+                  Schedule(replicates=2, scenario=Scenario(v=0.5, omega=0.8, length=3.0), seed=3,
+                           manoeuvres=("straight", "s_curve", "figure_eight")),
+                  plant=model.plant)
     fit_module.main(Arguments(dataset=folder / "log", out=folder / "run", model=str(function_file), iterations=12,
                               effects=("command_delay",)))
     return folder

@@ -61,7 +61,7 @@ def test_a_drive_of_which_a_piece_diverges_has_diverged(short_pieces):
     records = round(5.0 / plant.dt)
     command = jnp.zeros((records, 1, 2)).at[: records // 2, :, 0].set(1.0)  # at rest again in the end
     for speeds, expected in ((None, 0.0), (jnp.zeros((5, 2)), 1.0)):
-        path = rollout.path_of(quick, TRUTH, command, jnp.zeros(5), speeds=speeds)
+        path = rollout.path_of(quick, TRUTH, rollout.Commanded(command, jnp.zeros(5), speeds=speeds))
         assert path[:, 8].max() == 1.0 and path[-1, 8] == expected
 
 
@@ -104,8 +104,8 @@ def test_a_vehicle_is_recorded_the_same_on_an_accelerator(monkeypatch):
     plant = rollout.vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.005))
     params = preset_params(WHILL_CR, "physical")
     command = jnp.asarray(np.cumsum(np.random.default_rng(0).normal(0, 0.05, (60, 2, 2)), axis=0), jnp.float32)
-    expected = jax.jit(lambda c: rollout.path_of(plant, params, c, jnp.zeros(5)))(command)
+    expected = jax.jit(lambda c: rollout.path_of(plant, params, rollout.Commanded(c, jnp.zeros(5))))(command)
     monkeypatch.setattr(rollout, "on_processor", lambda: False)
-    found = jax.jit(lambda c: rollout.path_of(plant, params, c, jnp.zeros(5)))(command)
+    found = jax.jit(lambda c: rollout.path_of(plant, params, rollout.Commanded(c, jnp.zeros(5))))(command)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -20,7 +20,7 @@ from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, read_repor
 from sysid.pages.series import Channel, TrialSeries, collect, load, save
 from sysid.replay.rollout import make_batch, predictions, simulate
 from whill_mjx.io.html import Cell, Section, html_page, number, png, table
-from whill_mjx.io.svg import Line, bar_chart, interval_bar, line_chart
+from whill_mjx.io.svg import Axes, Line, bar_chart, interval_bar, line_chart
 
 pytestmark = pytest.mark.quick
 
@@ -201,7 +201,7 @@ def test_charts_skip_what_is_not_finite_and_say_when_nothing_is_left():
 
 def test_equal_axes_have_one_scale():
     square = Line(np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0, 1.0]))
-    points = re.search(r'<path d="(.*?)"', line_chart([square], "x", "y", equal=True)).group(1)
+    points = re.search(r'<path d="(.*?)"', line_chart([square], "x", "y", axes=Axes(equal=True))).group(1)
     numbers = np.array(re.findall(r"[-\d.]+", points), float).reshape(-1, 2)
     assert np.ptp(numbers[:, 0]) == pytest.approx(np.ptp(numbers[:, 1]), abs=0.2)
 

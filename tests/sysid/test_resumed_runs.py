@@ -19,7 +19,7 @@ from conftest import SHORT, TRUTH, unicycle_plant
 from warm_starter import Warm
 
 from sysid.fit import Arguments, main
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from whill_mjx.io import steps
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.vehicle.specs import WHILL_CR
@@ -36,8 +36,8 @@ class Stop(BaseException):
 def folder(tmp_path_factory):
     """A dataset of a cart, and the cart as a model to fit."""
     folder = tmp_path_factory.mktemp("resumed")
-    write_dataset(folder / "log", WHILL_CR, jnp.asarray(TRUTH), replicates=1, scenario=SHORT, plant=unicycle_plant(),
-                  seed=3)
+    write_dataset(folder / "log", WHILL_CR, jnp.asarray(TRUTH), Schedule(replicates=1, scenario=SHORT, seed=3),
+                  plant=unicycle_plant())
     (folder / "cart.py").write_text(cart("tau_v", "tau_omega", PARAMETERS))
     return folder
 

@@ -63,7 +63,7 @@ def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
     import jax
     import jax.numpy as jnp
 
-    from sysid.replay.rollout import path_of, vehicle_plant
+    from sysid.replay.rollout import Commanded, path_of, vehicle_plant
     from whill_mjx.effects import make_effect
     from whill_mjx.vehicle.config import VehicleConfig
     from whill_mjx.vehicle.presets import preset_params
@@ -83,7 +83,7 @@ def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
             return state, plant.observe(state)
         return jax.lax.scan(after, plant.place(params, start), command)[1]
 
-    found = jax.jit(lambda command: path_of(plant, params, command, start, few=True))(command)
+    found = jax.jit(lambda command: path_of(plant, params, Commanded(command, start), few=True))(command)
     assert np.abs(found).max() > 0.05
     np.testing.assert_allclose(found[1:], jax.jit(driven)(command), atol=1e-5)
 
@@ -174,7 +174,7 @@ def path_under_way(effect, command, start):
     import jax.numpy as jnp
 
     from sysid.replay.models import with_surroundings
-    from sysid.replay.rollout import WARM_UP, path_of
+    from sysid.replay.rollout import WARM_UP, Commanded, path_of
     from whill_mjx.effects import make_effect
     from whill_mjx.vehicle.types import VehicleParams
 
@@ -187,7 +187,7 @@ def path_under_way(effect, command, start):
                               lambda state, start: state.at[:3].set(start[:3]), 0.01)
     params = VehicleParams(None, (make_effect(effect[0], **effect[1]),))
     warm_up = round(WARM_UP / plant.dt)
-    return np.asarray(jax.jit(lambda start: path_of(plant, params, jnp.asarray(command), start, warm_up))(
+    return np.asarray(jax.jit(lambda start: path_of(plant, params, Commanded(jnp.asarray(command), start, warm_up)))(
         jnp.asarray(start)))
 
 

@@ -231,7 +231,7 @@ def test_intervals_of_a_robust_fit_are_not_those_of_its_outliers(objective):
 
 @pytest.mark.parametrize("cost", ["paper", "weighted"])
 def test_tpe_improves_on_the_initial_values(objective, cost):
-    result = tpe.fit(objective, objective.space, evaluations=64, seed=0, cost=cost, best=3)
+    result = tpe.fit(objective, objective.space, tpe.GlobalSearch(64, 0, cost, best=3))
     assert result.cost < 0.5 * result.initial_cost
     assert result.starts.shape == (3, 3) and (np.diff(result.history) <= 0).all()
 

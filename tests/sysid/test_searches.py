@@ -11,7 +11,7 @@ from cart import cart
 
 from sysid import searches
 from sysid.search import least_squares
-from sysid.search.comparison import METHODS, Judge, Recorder, arrivals, trace
+from sysid.search.comparison import METHODS, Effort, Judge, Recorder, arrivals, trace
 from sysid.search.fitting import make_problem
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
@@ -33,7 +33,7 @@ def problem(unicycle_log):
 def compared(unicycle_log, problem):
     """One run of each search."""
     judge = Judge(problem, unicycle_log)
-    return [trace(problem, judge, 0.5, method, 0, evaluations=64, iterations=14, start_count=2)
+    return [trace(problem, judge, method, 0, Effort(64, 14, 2))
             for method in METHODS]
 
 
@@ -104,4 +104,4 @@ def test_the_command_writes_page_picture_and_figures(tmp_path, unicycle_log, mon
 @pytest.mark.quick
 def test_an_unknown_search_is_refused(problem, unicycle_log):
     with pytest.raises(ValueError, match="no search 'annealing' .known: features"):
-        trace(problem, Judge(problem, unicycle_log), 0.5, "annealing", 0)
+        trace(problem, Judge(problem, unicycle_log), "annealing", 0, Effort())

@@ -10,7 +10,7 @@ import pytest
 
 from sysid.errors.space import RATIO, Space, make_space, searched
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import write_dataset
+from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.replay.differences import make_replay
 from sysid.replay.models import measured_effects, with_effects
 from sysid.search.fitting import fitted_plant
@@ -88,8 +88,8 @@ def test_along_that_valley_a_vehicle_drives_nearly_alike(tmp_path):
     """The list of what is told per inertia is what the vehicle's equations say; a straight step leaves the valley."""
     spec, params, space = light_space()
     plant = fitted_plant(spec)
-    log = load_log(write_dataset(tmp_path / "log", spec, params, manoeuvres=("s_curve",), held_out=(), replicates=1,
-                                 plant=plant))
+    log = load_log(write_dataset(tmp_path / "log", spec, params,
+                                 Schedule(manoeuvres=("s_curve",), held_out=(), replicates=1), plant=plant))
     replay, _ = make_replay(plant, params, space, log.training)
     u = space.to_unit(space.initial)
     step = along_the_valley(space, u, 0.15)

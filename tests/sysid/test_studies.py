@@ -18,14 +18,14 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
 from sysid.search import studies, tpe
-from sysid.search.studies import BATCH, SharedStudy, open_storage
+from sysid.search.studies import BATCH, SharedStudy, StudyPlace, open_storage
 
 NAMES = ("a", "b")
 GOAL = np.array([0.3, 0.8])
 WORKER = """
 import sys, time
 import numpy as np
-from sysid.search.studies import SharedStudy, open_storage
+from sysid.search.studies import SharedStudy, StudyPlace
 
 storage, evaluations, pause = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 
@@ -33,7 +33,7 @@ def costs(u):
     time.sleep(pause)
     return np.square(u - [0.3, 0.8]).sum(-1) + 1e-3
 
-study = SharedStudy(("a", "b"), np.array([0.5, 0.5]), storage=open_storage(storage), study="shared", method=sys.argv[4])
+study = SharedStudy(("a", "b"), np.array([0.5, 0.5]), StudyPlace(storage, "shared"), method=sys.argv[4])
 study.run(costs, evaluations)
 """
 
@@ -125,7 +125,7 @@ def test_a_study_that_lost_its_only_process_goes_on_where_it_was(tmp_path):
     alone.kill()
     alone.wait()
     before = {trial.number: trial.value for trial in trials_of(storage) if trial.state.name == "COMPLETE"}
-    study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(storage), study="shared", method="cmaes")
+    study = SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(storage, "shared"), method="cmaes")
     study.run(quadratic, len(before) + 2 * BATCH["cmaes"])
     after = {trial.number: trial.value for trial in trials_of(storage) if trial.state.name == "COMPLETE"}
     assert before.items() <= after.items()
@@ -176,7 +176,7 @@ def test_processes_share_a_study_in_postgresql_and_one_may_be_killed(postgresql)
 
 
 def test_cmaes_finds_the_planted_parameters(objective):
-    result = tpe.fit(objective, objective.space, evaluations=15 * BATCH["cmaes"], seed=1, method="cmaes")
+    result = tpe.fit(objective, objective.space, tpe.GlobalSearch(15 * BATCH["cmaes"], 1, method="cmaes"))
     assert result.evaluations == 15 * BATCH["cmaes"]
     assert result.cost < 1.5 < result.initial_cost
     np.testing.assert_allclose(UNICYCLE_SPACE.to_values(result.u), TRUTH, rtol=0.15)
@@ -192,7 +192,7 @@ def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_f
         first.append(u[0])
         return quadratic(u)
 
-    study = SharedStudy(NAMES, np.array([0.5, 0.6]), method=method, seed=3)
+    study = SharedStudy(NAMES, np.array([0.5, 0.6]), StudyPlace(), method=method, seed=3)
     study.run(costs, 60)
     u, values, initial = study.table()
     assert set(sizes) == {batch} and len(sizes) == 1 + -(-59 // batch) and len(u) == 60
@@ -205,10 +205,10 @@ def test_candidates_are_simulated_in_whole_batches_and_the_initial_values_come_f
 @pytest.mark.quick
 def test_a_line_that_was_not_written_to_its_end_is_cut_off(tmp_path):
     path = tmp_path / "study.log"
-    SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(f"journal:{path}")).run(quadratic, 5)
+    SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(f"journal:{path}")).run(quadratic, 5)
     with open(path, "ab") as file:
         file.write(b'{"op_code": 6, "worker')
-    study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=open_storage(f"journal:{path}"))
+    study = SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(f"journal:{path}"))
     study.run(quadratic, 9)
     assert len(study.table()[0]) == 9
 
@@ -220,7 +220,7 @@ def test_a_candidate_whose_process_died_before_naming_it_is_given_up_before_the_
     storage = open_storage(f"journal:{tmp_path / 'study.log'}")
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    study = SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, study="shared")
+    study = SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(storage, "shared"))
     study.run(quadratic, 1)
     known = study._study
     known.set_user_attr("worker: 1", {"host": socket.gethostname(), "pid": dead.pid, "began": 0.0, "seen": 0.0})
@@ -240,7 +240,7 @@ def test_a_candidate_whose_process_died_before_naming_it_is_given_up_before_the_
 @pytest.mark.quick
 def test_processes_with_one_seed_draw_different_candidates(tmp_path):
     storage = open_storage(f"journal:{tmp_path / 'study.log'}")
-    one, other = (SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, seed=5) for _ in range(2))
+    one, other = (SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(storage), seed=5) for _ in range(2))
     one.run(quadratic, 17)
     other.run(quadratic, 33)
     u = one.table()[0]
@@ -250,11 +250,11 @@ def test_processes_with_one_seed_draw_different_candidates(tmp_path):
 @pytest.mark.quick
 def test_a_study_of_another_problem_is_refused(tmp_path):
     storage = open_storage(f"journal:{tmp_path / 'study.log'}")
-    SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, problem={"data": "monday"})
+    SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(storage, problem={"data": "monday"}))
     with pytest.raises(ValueError, match="its data is 'monday', here 'tuesday'. Choose another --study"):
-        SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, problem={"data": "tuesday"})
+        SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(storage, problem={"data": "tuesday"}))
     with pytest.raises(ValueError, match="its method is 'tpe', here 'cmaes'"):
-        SharedStudy(NAMES, np.array([0.5, 0.5]), storage=storage, method="cmaes", problem={"data": "monday"})
+        SharedStudy(NAMES, np.array([0.5, 0.5]), StudyPlace(storage, problem={"data": "monday"}), method="cmaes")
 
 
 URLS = [

@@ -93,7 +93,7 @@ def test_a_diverged_vehicle_ends_the_episode_and_is_counted(course):
     assert np.isfinite(float(outcome.reward)) and np.isfinite(np.asarray(after.vehicle.qpos)).all()
 
 
-@pytest.mark.parametrize("action", [[jnp.nan, 0.0], [1.0, jnp.nan]])
+@pytest.mark.parametrize("action", [[jnp.nan, 0.0], [1.0, jnp.nan], [jnp.inf, 0.0]])
 def test_an_action_that_is_no_number_is_standstill_and_ends_the_episode(course, action):
     _, params, begin, advance = course
     state = begin(params, jax.random.key(0))
@@ -144,6 +144,8 @@ def test_unknown_tasks_and_layouts_are_refused():
         make_env("slalom")
     with pytest.raises(ValueError, match="randomised"):
         make_env("corridor", layout="maze")
+    with pytest.raises(ValueError, match="task is 3; give a Task"):
+        make_env(3)
 
 
 @pytest.mark.quick

@@ -81,7 +81,7 @@ def test_walls_and_the_distance_field_of_one_map_agree():
     bare = Scene(no_boxes(0), MARKER, default_looks())
     angle = jnp.linspace(-3.0, 3.0, 61)
     by_walls = np.asarray(first_hits(scene, 1.5, 1.0, angle, 0.3))
-    by_field = np.asarray(first_hits(bare, 1.5, 1.0, angle, 0.3, distance_field(grid), 10.0))
+    by_field = np.asarray(first_hits(bare, 1.5, 1.0, angle, 0.3, distance_field(grid)))
     assert np.abs(by_walls - by_field).max() < 0.04  # half a cell, more where a ray runs along a wall
     assert np.isinf(np.asarray(first_hits(scene, 1.5, 1.0, angle, 3.0))).all()  # above the walls
     expected = np.where(abs(np.sin(3.0)) > 0, (1.5 - 0.25) / abs(np.cos(3.0)), 0)

@@ -34,7 +34,7 @@ class Options:
 
 
 @pytest.mark.parametrize("words, told", [
-    (["--steps", "0"], r"--steps 0: must be at least 1\."),
+    (["--steps", "0"], r"--steps 0: must be at least 1 "),
     (["--share", "1.5"], r"--share 1\.5: must be at least 0 and at most 1\. .* for 0\.5\."),
     (["--lr", "nan"], "--lr nan: must be a finite number"),
     (["--lr", "-inf"], "--lr -inf: must be a finite number"),

@@ -15,7 +15,7 @@ import tiny_steps
 from test_chaos_training import SIGNALS, finished, started
 
 from whill_mjx.io import steps
-from whill_mjx.io.steps import keep_steps, step
+from whill_mjx.io.steps import keep_steps, step, steps_of_rows
 
 pytestmark = pytest.mark.quick
 IDENTITY = {"data": "a", "seed": 0}
@@ -103,6 +103,27 @@ def test_inner_steps_are_found_after_a_stop_and_vanish_with_the_end_of_the_outer
         assert [path.name for path in (tmp_path / "steps").iterdir()] == ["000000.npz"]
         raise Stop
     assert inner == [0, 1, 2]
+
+
+def test_of_many_rows_only_the_last_few_are_computed_again(tmp_path):
+    rows, computed = np.arange(20.0).reshape(10, 2), []
+
+    def compute(part):
+        if len(computed) == 2:
+            raise Stop
+        computed.append(len(part))
+        return [2 * part, part.sum(1)]
+
+    def work():
+        with keep_steps(tmp_path / "steps", IDENTITY):
+            return step("outer", lambda: steps_of_rows("inner", compute, rows, 3), rows)
+
+    with pytest.raises(Stop):
+        work()
+    computed.pop()
+    doubled, sums = work()
+    assert computed == [4, 3]
+    assert np.array_equal(doubled, 2 * rows) and np.array_equal(sums, rows.sum(1))
 
 
 def test_work_stopped_at_random_steps_ends_in_the_bits_of_uninterrupted_work(tmp_path, monkeypatch):

@@ -317,6 +317,8 @@ def test_a_folder_with_somebodys_files_is_refused_before_the_training(tmp_path, 
     ("--vehicle nope", "unknown vehicle 'nope'.*whill_cr_paper"), ("--change lr=NaN", "lr=NaN"),
     ("--change batch_size=0", "batch_size = 0: it must be at least 1"), ("--change nope=1", "changes no setting"),
     ("--change mults=3", "give a finite value like it"), ("--log nowhere", "--log nowhere: no such dataset"),
+    ("--log Makefile", "Makefile: "), ("--change lr=0.1 lr=0.2", "lr is given twice"),
+    ("--steps 99999999999999999999", "at most 1000000000000"),
     ("--vehicle whill_cr --log .", "nothing is fitted"),
     ("--learner ppo --instances 3 --change minibatches=7", "split"),
 ])  # fmt: skip

@@ -42,7 +42,8 @@ def test_fit_stands_for_the_intervals_of_the_vehicle_file(tmp_path):
     ("body.mass", "is no variation"), ("body.mass=1:0", "is no variation"), ("body.mass=0.9x:2", "is no variation"),
     ("body.mass=a:b", "is no variation"), ("body.mass=0:inf", "is no variation"),
     ("body.weight=1:2", "no parameter 'weight'"), ("glue.force=1:2", "no effect 'glue'"),
-    ("mass=1:2", "no effect 'mass'"),
+    ("mass=1:2", "no effect 'mass'"), ("body.mass=-5:3", "body.mass is -5"), ("body.mass=0x:1x", "factor is 0"),
+    ("yaw_scrub.torque=0:1e9", "yaw_scrub.torque is 1000000000"),
 ])  # fmt: skip
 def test_a_wrong_variation_is_refused(text, said):
     with pytest.raises(ValueError, match=said):

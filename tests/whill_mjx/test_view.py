@@ -22,7 +22,7 @@ from whill_mjx.browser.read import find_runs, read_run, read_runs
 from whill_mjx.browser.serve import Site, make_server
 from whill_mjx.io import html
 from whill_mjx.io.command_line import OptionError
-from whill_mjx.io.svg import PALETTE, Line, bar_chart, line_chart
+from whill_mjx.io.svg import PALETTE, Axes, Line, bar_chart, line_chart
 from whill_mjx.view import ViewOptions, main
 
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>\'</td>'
@@ -234,7 +234,7 @@ CHROMIUM = next((path for name in BROWSERS if (path := shutil.which(name))), Non
 def test_pages_fit_a_telephone_in_a_real_browser(tmp_path):
     x = np.linspace(0, 9, 50)
     blocks = [html.paragraph("long" * 200), html.table([f"column {k}" for k in range(30)], [["cell"] * 30]),
-              html.charts([line_chart([Line(x, np.sin(x))], "x", "y", "t", width=900)] * 2),
+              html.charts([line_chart([Line(x, np.sin(x))], "x", "y", "t", Axes(width=900))] * 2),
               bar_chart(["a", "b"], {"s": [1.0, 2.0]}, "y", width=1100), html.bullets(["x" * 300]),
               html.legend([("n" * 40, PALETTE[0])] * 9), html.links([("p" * 200, "t")])]  # fmt: skip
     sections = [html.Section(f"Section {k}", block) for k, block in enumerate(blocks)]

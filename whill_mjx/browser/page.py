@@ -15,7 +15,7 @@ from urllib.parse import quote
 from whill_mjx.browser.read import Replay, Run, curve, differing, guarded, inside, read_drives, read_replays
 from whill_mjx.io import html
 from whill_mjx.io.reading import read_bytes
-from whill_mjx.io.svg import COLOURS, PALETTE, Line, line_chart, replay_line
+from whill_mjx.io.svg import COLOURS, PALETTE, Axes, Line, line_chart, replay_line
 
 CURVES = (
     ("eval/success", "evaluations: success"), ("eval/return", "evaluations: return"),
@@ -141,7 +141,7 @@ def _chart(runs: Sequence[Run], name: str, title: str) -> str:
         x, y = curve(run.lines, name)
         if len(x):
             lines.append(Line(x, y, "", _colour(k), markers=len(x) < (40 if name.startswith("eval/") else 3)))
-    return line_chart(lines, "environment steps", "", title, width=340, height=230) if lines else ""
+    return line_chart(lines, "environment steps", "", title, Axes(width=340, height=230)) if lines else ""
 
 
 def _colour(index: int) -> str:
@@ -213,7 +213,8 @@ def drives(runs: Sequence[Run], problems: dict[str, list[str]]) -> str:
             if found is not None and found.paths:
                 lines = [Line(one[:, 0], one[:, 1], "", ENDINGS[how][1], markers=False)
                          for one, how in zip(found.paths, found.endings, strict=True)]
-                chart = line_chart(lines, "x [m]", "y [m]", f"{len(lines)} drives", equal=True, width=560, height=330)
+                axes = Axes(equal=True, width=560, height=330)
+                chart = line_chart(lines, "x [m]", "y [m]", f"{len(lines)} drives", axes)
                 keys = html.legend([ENDINGS[how] for how in dict.fromkeys(found.endings)])
                 parts += [html.heading(run.name), keys, html.charts([chart])]
         if (path := run.path / "series.npz").is_file():
@@ -229,7 +230,7 @@ def _replayed(trial: Replay) -> str:
     """A trial of a fit from above."""
     lines = [replay_line(one[:, 0], one[:, 1], name) for name, one in trial.paths.items()]
     title = trial.name + (" (held out)" if trial.held_out else "")
-    return line_chart(lines, "x [m]", "y [m]", title, equal=True, smallest=0.3)
+    return line_chart(lines, "x [m]", "y [m]", title, Axes(equal=True, smallest=0.3))
 
 
 def media(

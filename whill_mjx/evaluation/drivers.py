@@ -34,6 +34,8 @@ class Driver:
     """Whether `act` looks at the image; if not, none is rendered."""
     weights: Any = None
     """Arrays that `act` then gets before the others: arguments of a compiled evaluation, which serves any values."""
+    memory: Any = None
+    """First memory of each episode, leaves (N, ...), in place of what `begin` gives."""
 
     def decide(self, memory: Any, state: State, image: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         """Memory and action of one instance."""

@@ -171,8 +171,8 @@ class Course:
         if name not in self._compiled:
 
             def run(weights: Any, params: Any, keys: Any, condition: Any, memory: Any) -> Rollout:
-                given = dataclasses.replace(driver, weights=weights)
-                return rollout(self.env, params, keys, given, condition, view=view, memory=memory)
+                given = dataclasses.replace(driver, weights=weights, memory=memory)
+                return rollout(self.env, params, keys, given, condition, view=view)
 
             self._compiled[name] = jax.jit(run)
         return self._compiled[name]

@@ -133,7 +133,8 @@ def _split(xp, attributes, count, values, sizes=None):
     return xp.split(values, np.cumsum(_ints(sizes))[:-1], axis)
 
 
-def _slice(xp, attributes, count, values, starts, ends, axes=None, steps=None):
+def _slice(xp, attributes, count, values, *where):
+    starts, ends, axes, steps = (*where, None, None)[:4]
     chosen = _ints(axes) if axes is not None else tuple(range(len(_ints(starts))))
     strides = _ints(steps) if steps is not None else (1,) * len(chosen)
     index: list[slice] = [slice(None)] * values.ndim
@@ -144,7 +145,8 @@ def _slice(xp, attributes, count, values, starts, ends, axes=None, steps=None):
     return values[tuple(index)]
 
 
-def _pad(xp, attributes, count, values, pads, constant=None, axes=None):
+def _pad(xp, attributes, count, values, *how):
+    pads, constant, axes = (*how, None, None)[:3]
     if attributes.get("mode", b"constant") != b"constant":
         raise ValueError("only constant padding is known here. Evaluate with the runtime 'onnxruntime' instead.")
     bounds = _ints(pads)

@@ -57,7 +57,6 @@ def rollout(
     condition: Condition | None = None,
     *,
     view: View = View(),  # noqa: B008
-    memory: Any = None,
 ) -> Rollout:
     """Drive one episode from each key, until all have ended.
 
@@ -70,7 +69,6 @@ def rollout(
         driver: who drives.
         condition: leaves (N,); None changes nothing.
         view: what the driver is shown, and whether images are kept.
-        memory: first memory of the driver, leaves (N, ...); None takes the driver's own.
     """
     env = dataclasses.replace(env, task=dataclasses.replace(env.task, action_repeat=1))
     changed = condition is not None
@@ -81,8 +79,7 @@ def rollout(
         states = jax.vmap(lambda c, p, state: begin_under(c, env, p, state))(condition, params, states)
     drive_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
     names = end_names(env, jax.tree.map(lambda leaf: leaf[0], states))
-    if memory is None:
-        memory = jax.vmap(driver.begin)(states, drive_keys)
+    memory = jax.vmap(driver.begin)(states, drive_keys) if driver.memory is None else driver.memory
     sensing = _Sensing(env, params, condition, changed)
     _, shapes = jax.eval_shape(sensing.take, states)
     blind = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)

@@ -109,10 +109,16 @@ def _parse_axis(text: str) -> Axis:
         raise ValueError(f"{text!r}: {error}; write NAME=a,b,c or NAME=low:high:count.") from error
     if not numbers.size:
         raise ValueError(f"{text!r}: has no value; write NAME=a,b,c or NAME=low:high:count.")
+    if len(np.unique(numbers)) < len(numbers):
+        raise ValueError(f"{text!r}: a value is there twice. Leave one out.")
     if not np.isfinite(numbers).all():
         raise ValueError(f"{text!r}: values must be finite.")
-    for value in (numbers.min(), numbers.max()) if name in CONDITION else ():
-        check(f"{text!r}", CONDITION[name], value)
+    ends = float(numbers.min()), float(numbers.max())
+    if name in CONDITION:
+        for value in ends:
+            check(f"{text!r}", CONDITION[name], value)
+    elif "." in name:
+        check_parameter(f"axis {name!r}", name, ends, relative)
     return Axis(name, tuple(float(np.round(number, 9)) for number in numbers), relative)
 
 
@@ -120,8 +126,6 @@ def _check_name(name: str) -> None:
     if "." not in name and name not in CONDITIONS:
         raise ValueError(f"unknown axis {name!r} (known: {', '.join(CONDITIONS)}, vehicle, EFFECT.PARAMETER and "
                          "body.PARAMETER).")
-    if "." in name:
-        check_parameter(f"axis {name!r}", name)
 
 
 def run_sweep(

@@ -78,8 +78,8 @@ class Range:
         return " and ".join(part for part in (low, high) if part) or "a finite number"
 
 
-COUNT = Range(1)
-"""At least one of something."""
+COUNT = Range(1, 10**12)
+"""At least one of something, and no more than 64 bits count."""
 NOT_NEGATIVE = Range(0)
 POSITIVE = Range(0, above=True)
 SHARE = Range(0, 1)
@@ -105,6 +105,13 @@ def check_known(option: str, value: str, known: Iterable[str]) -> None:
         raise OptionError(f"{option} {value}: unknown (known: {', '.join(names)}). Correct the name.")
 
 
+def check_once(option: str, values: Sequence[Any]) -> None:
+    """Raise OptionError where one of the values is there twice."""
+    for index, value in enumerate(values):
+        if value in values[:index]:
+            raise OptionError(f"{option} {value}: is given twice. Leave one out.")
+
+
 @contextmanager
 def refusing() -> Iterator[None]:
     """Turn a ValueError or FileNotFoundError of the block into OptionError: nothing was touched yet."""
@@ -126,6 +133,8 @@ def check_options(options: Any, prefix: str = "") -> None:
             check_options(value, f"{name}.")
             continue
         marks = getattr(hints[field.name], "__metadata__", ())
+        if _is_list(hints[field.name].__origin__ if marks else hints[field.name]):
+            check_once(f"--{name}", value)
         allowed = next((mark for mark in marks if isinstance(mark, Range)), Range())
         default = None if field.default is dataclasses.MISSING else field.default
         check_range(f"--{name}", value, allowed, default)
@@ -133,25 +142,25 @@ def check_options(options: Any, prefix: str = "") -> None:
 
 def run(
     options: type, main: Callable[[Any], Any], description: str | None, *, stopped: str = STOPPED,
-    positional: bool = True, args: list[str] | None = None, shares: Callable[[Any], bool] = lambda chosen: True,
+    positional: bool = True, args: list[str] | None = None,
 ) -> None:  # fmt: skip
     """Read `options` from the command line, check them and call `main`; what goes wrong ends with one line.
 
     What XLA compiles is kept for later runs (`whill_mjx.io.compiled`).
 
     Args:
-        options: dataclass of the options; numbers may be Annotated with a `Range`.
+        options: dataclass of the options; numbers may be Annotated with a `Range`. Its `shares_results`, if it has one,
+            says whether the command may use `share_results`; JAX must not have started before.
         main: gets the options.
         description: the command's help.
         stopped: the line after a signal, which says how to go on.
         positional: options without a default are given without their names.
         args: words instead of those of the command line.
-        shares: whether a command with these options may use `share_results`; JAX must not have started before.
     """
     with guarded(stopped):
         chosen = _parsed(options, description, positional, args)
         check_options(chosen)
-        (share_results if shares(chosen) else keep_results_apart)()
+        (share_results if getattr(chosen, "shares_results", True) else keep_results_apart)()
         keep_compiled()
         main(chosen)
 
@@ -204,7 +213,9 @@ def _parsed(options: type, description: str | None, positional: bool, args: list
     """The options of the command line; what tyro finds wrong in them becomes one line."""
     import tyro
 
-    check_words(sys.argv[1:] if args is None else args)
+    words = sys.argv[1:] if args is None else args
+    check_words(words)
+    check_lists(options, words)
     config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
     with redirect_stderr(io.StringIO()) as complaint:
         try:
@@ -228,6 +239,24 @@ def check_words(words: Sequence[str]) -> None:
         if not word.strip() or name.startswith("--") and "=" in word and not value.strip():
             option = before if before.startswith("--") else name.strip() or "the command line"
             raise OptionError(f"{option}: an empty word, as of a shell variable that is not set. Give a value.")
+
+
+def check_lists(options: type, words: Sequence[str]) -> None:
+    """Refuse an option that takes any number of values and has none, as of a shell variable that is not set.
+
+    Raises:
+        OptionError: the option.
+    """
+    hints = typing.get_type_hints(options)
+    lists = {f"--{name}".replace("_", "-") for name, hint in hints.items() if _is_list(hint)}
+    for word, after in zip(words, [*words[1:], "--"], strict=False):
+        if word.replace("_", "-") in lists and after.startswith("--"):
+            raise OptionError(f"{word}: none is given. Give a value, or leave the option out.")
+
+
+def _is_list(hint: Any) -> bool:
+    """Whether an option of this type takes any number of values."""
+    return typing.get_origin(hint) is tuple and typing.get_args(hint)[-1] is Ellipsis
 
 
 def one_line(error: BaseException) -> str:

@@ -68,6 +68,13 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 def check_place(option: str, path: Path, least_free: int = LEAST_FREE) -> None:
     """Raise FolderRefused where nothing could be written at `path`, which need not exist; nothing is created."""
+    try:
+        _check_place(option, path, least_free)
+    except OSError as error:  # a name that is too long, a loop of links
+        raise FolderRefused(f"{option} {path}: {error.strerror or error}. Choose another place.") from None
+
+
+def _check_place(option: str, path: Path, least_free: int) -> None:
     above = path.absolute()
     while not above.exists() and above != above.parent:
         if above.is_symlink():
@@ -135,9 +142,9 @@ def claim_folder(out: Path, kind: str, outputs: Iterable[str] = (), least_free: 
     Raises:
         FolderRefused: it is no folder, cannot be written, is held by another process, or belongs to others.
     """
+    check_place("--out", out, least_free)
     if out.exists() and not out.is_dir():
         raise FolderRefused(f"--out {out}: is a file, not a folder. Choose another place.")
-    check_place("--out", out, least_free)
     for place in (out.absolute(), *out.absolute().parents):
         if place.name == "trials" and (place.parent / "dataset.toml").exists():
             raise FolderRefused(f"--out {out}: lies among the trials of {place.parent}. Choose another place.")

@@ -18,6 +18,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,20 @@ def step(name: str, compute: Callable[[], Sequence[Any]], *inputs: Any) -> list[
     """
     kept = _KEPT.get()
     return _arrays(compute) if kept is None else kept.step(name, compute, inputs)
+
+
+def steps_of_rows(
+    name: str, compute: Callable[[np.ndarray], Sequence[Any]], rows: np.ndarray, count: int
+) -> list[np.ndarray]:
+    """The arrays (N, ...) that `compute` gives for rows (N, ...), each `count` rows or more as a step.
+
+    So what is lost by a kill does not grow with the number of rows. Rows that make one step alone are just computed.
+    """
+    parts = np.array_split(rows, max(len(rows) // count, 1))
+    if len(parts) == 1:
+        return _arrays(lambda: compute(rows))
+    found = [step(name, partial(compute, part), part) for part in parts]
+    return [np.concatenate(arrays) for arrays in zip(*found, strict=True)]
 
 
 @contextmanager

@@ -35,17 +35,25 @@ def replay_line(x: np.ndarray, y: np.ndarray, replay: str) -> Line:
     return Line(x, y, "", COLOURS[replay], DASHES[replay], 2.2 if replay == "measured" else 1.3)
 
 
-def line_chart(
-    lines: Sequence[Line], x_label: str, y_label: str, title: str = "", *, equal: bool = False,
-    width: int = 360, height: int = 270, band: tuple[float, float] | None = None, smallest: float = 0.0,
-) -> str:
-    """SVG of lines over one another.
+@dataclass(frozen=True)
+class Axes:
+    """How lines are drawn."""
 
-    Args:
-        equal: one metre is as long across as up.
-        band: shaded range of y.
-        smallest: least span of both axes, so that noise does not fill the chart.
-    """
+    width: int = 360
+    height: int = 270
+    equal: bool = False
+    """One metre is as long across as up."""
+    smallest: float = 0.0
+    """Least span of both axes, so that noise does not fill the chart."""
+    band: tuple[float, float] | None = None
+    """Shaded range of y."""
+
+
+def line_chart(
+    lines: Sequence[Line], x_label: str, y_label: str, title: str = "", axes: Axes = Axes(),  # noqa: B008
+) -> str:  # fmt: skip
+    """SVG of lines over one another."""
+    width, height, band = axes.width, axes.height, axes.band
     drawn = [line for line in lines if len(line.x)]
     xs = [line.x[np.isfinite(line.x) & np.isfinite(line.y)] for line in drawn]
     ys = [line.y[np.isfinite(line.x) & np.isfinite(line.y)] for line in drawn]
@@ -53,9 +61,9 @@ def line_chart(
     y = np.concatenate([*ys, list(band or [])])
     if not len(x):
         return f"<p>{escape(title)}: nothing to show.</p>"
-    x_range, y_range = _range(x, smallest), _range(y, smallest)
+    x_range, y_range = _range(x, axes.smallest), _range(y, axes.smallest)
     inner_width, inner_height = width - LEFT - RIGHT, height - TOP - BOTTOM
-    if equal:
+    if axes.equal:
         scale = max((x_range[1] - x_range[0]) / inner_width, (y_range[1] - y_range[0]) / inner_height)
         x_range, y_range = _centred(x_range, scale * inner_width), _centred(y_range, scale * inner_height)
 

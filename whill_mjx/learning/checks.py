@@ -40,7 +40,7 @@ def keep_best(out: Path, preset: Preset, evaluate: Evaluate) -> Evaluate:
         before = read_best(out)
         # A run that goes on from an older checkpoint comes by the same steps again.
         if before is None or _rank(figures) > _rank(before) or before["env_steps"] == env_steps:
-            checkpoint.save(out / "best", {"params": params}, preset.learner, env_steps)
+            checkpoint.save(out / "best", {"params": params}, preset.learner, checkpoint.Moment(env_steps))
             if parallel.is_first_process():
                 write_json(out / "best.json", {"env_steps": env_steps, **figures})
         return figures

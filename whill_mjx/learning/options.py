@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import jax
 
-from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Range, check_known
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, SHARE, Range, check_known
 from whill_mjx.learning.setup import TRUTH, Preset, find_preset, with_layout, with_repeat, with_settings
 from whill_mjx.learning.shaping import SAFETY, find_safety
 from whill_mjx.tasks.options import named_task, read_fields
@@ -57,7 +57,7 @@ class TrainOptions:
     """Time between checkpoints [s]."""
     lr: Annotated[float | None, Range(0, 1, above=True)] = None
     """Learning rate; none takes the preset's."""
-    train_ratio: Annotated[float | None, POSITIVE] = None
+    train_ratio: Annotated[float | None, Range(0, 1e6, above=True)] = None
     """Replayed steps per environment step; none takes the preset's."""
     change: tuple[str, ...] = ()
     """Other settings of the learner, such as greedy_share=0.25 entropy_scale=3e-4."""

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dreamer.export import PolicyContract, export_policy, export_sensing
+from dreamer.export import PolicyContract, SensingPolicy, export_policy, export_sensing
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import episode_keys
 from whill_mjx.evaluation.novelty import SURPRISE, largest_surprise, limits
@@ -83,7 +83,7 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
     shown, step = obs_shape_of(course.env), partial(policy, weights)
     try:
         if isinstance(shown, dict):
-            return export_sensing(path, step, carry, shown, result.params, contract, vehicle_file=vehicle)
+            return export_sensing(path, SensingPolicy(step, carry, shown, result.params), contract, vehicle)
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:
         say(f"the policy file is left out: {error}. Install the base package and give the same command again.")

@@ -135,7 +135,8 @@ class _Run:
 
     def _save(self) -> None:
         steps = int(self.state.updates) * self.each
-        checkpoint.save(self.out / "checkpoints", self.state, self.config, steps, self.wall_s())
+        moment = checkpoint.Moment(steps, self.wall_s())
+        checkpoint.save(self.out / "checkpoints", self.state, self.config, moment)
 
     def _evaluated(self, metrics: dict[str, Any]) -> dict[str, float]:
         """The line of an evaluation, written to the log."""

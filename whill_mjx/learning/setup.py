@@ -221,6 +221,8 @@ def with_settings(learner: Any, settings: Sequence[str]) -> Any:
     changes = {}
     for text in settings:
         name, _, value = text.partition("=")
+        if name in changes:
+            raise ValueError(f"{text!r}: {name} is given twice. Leave one out.")
         if name not in known:
             raise ValueError(f"{text!r} changes no setting of the learner; these are: {', '.join(sorted(known))}.")
         try:
@@ -391,6 +393,10 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
             raise ValueError(f"vary 'fit': {vehicle} has no intervals. Give a file that sysid.fit wrote, or ranges "
                              "such as body.mass=0.9x:1.1x.")
         found += [Variation(name, low, high) for name, (low, high) in intervals.items()]
+    names = [text.partition("=")[0] for text in texts]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"vary {' '.join(texts)}: {name} is given twice. Leave one out.")
     return tuple(found)
 
 

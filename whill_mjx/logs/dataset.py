@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,26 @@ COMMAND_HEADER, ODOMETRY_HEADER, POSE_HEADER = "t,v,omega", "t,x,y,yaw,v,omega",
 IMU_HEADER, ENCODER_HEADER = "t,gyro", "t,left,right,counter"
 
 
+class Noise(NamedTuple):
+    """White noise that is added to measurements."""
+
+    levels: SensorNoise | None = None
+    """None adds none."""
+    random: np.random.Generator = np.random.default_rng(0)
+
+    def on(self, values: np.ndarray, *names: str) -> np.ndarray:
+        """Values (M, C) with the noise of those names, one a column or one for all."""
+        values = np.array(values, float)
+        if self.levels is not None:
+            values += self.random.normal(size=values.shape) * [getattr(self.levels, name) for name in names]
+        return values
+
+
+EXACT = Noise()
+
+
 def write_trial(
-    folder: Path, t: np.ndarray, command: np.ndarray, pose: np.ndarray, odometry: np.ndarray,
-    noise: SensorNoise | None = None, random: np.random.Generator | None = None,
+    folder: Path, t: np.ndarray, command: np.ndarray, pose: np.ndarray, odometry: np.ndarray, noise: Noise = EXACT
 ) -> None:
     """Write the three streams of one trial.
 
@@ -30,55 +47,34 @@ def write_trial(
         command: (T, 3) t, v, omega.
         pose: (M, 3) x, y, yaw of the reference point in the room; yaw is wrapped to (-pi, pi].
         odometry: (M, 5) x, y, yaw, v, omega.
-        noise, random: white noise to add to both measurements; none leaves them exact.
+        noise: on both measurements.
     """
-    random = random or np.random.default_rng(0)
     write_csv(folder / "command.csv", COMMAND_HEADER, command)
-    write_ground_truth(folder, t, pose, noise, random)
-    write_odometry(folder, t, odometry, noise, random)
+    write_ground_truth(folder, t, pose, noise)
+    write_odometry(folder, t, odometry, noise)
 
 
-def write_ground_truth(
-    folder: Path, t: np.ndarray, pose: np.ndarray, noise: SensorNoise | None, random: np.random.Generator
-) -> None:
-    """Write the outside pose (M, 3), with noise unless it is None."""
-    pose = np.array(pose, float)
-    if noise is not None:
-        pose += random.normal(size=pose.shape) * [noise.position, noise.position, noise.yaw]
+def write_ground_truth(folder: Path, t: np.ndarray, pose: np.ndarray, noise: Noise) -> None:
+    """Write the outside pose (M, 3)."""
+    pose = noise.on(pose, "position", "position", "yaw")
     pose[:, 2] = wrapped(pose[:, 2])
     write_csv(folder / "ground_truth.csv", POSE_HEADER, np.column_stack([t, pose]))
 
 
-def write_odometry(
-    folder: Path, t: np.ndarray, odometry: np.ndarray, noise: SensorNoise | None, random: np.random.Generator
-) -> None:
-    """Write the odometry (M, 5), with noise unless it is None."""
-    odometry = np.array(odometry, float)
-    if noise is not None:
-        scales = [noise.odometry_position, noise.odometry_position, noise.odometry_yaw, noise.v, noise.omega]
-        odometry += random.normal(size=odometry.shape) * scales
+def write_odometry(folder: Path, t: np.ndarray, odometry: np.ndarray, noise: Noise) -> None:
+    """Write the odometry (M, 5)."""
+    odometry = noise.on(odometry, "odometry_position", "odometry_position", "odometry_yaw", "v", "omega")
     write_csv(folder / "odometry.csv", ODOMETRY_HEADER, np.column_stack([t, odometry]))
 
 
-def write_imu(
-    folder: Path, t: np.ndarray, gyro: np.ndarray, noise: SensorNoise | None, random: np.random.Generator
-) -> None:
-    """Write the gyro's yaw rate (M, 1), with noise unless it is None."""
-    gyro = np.array(gyro, float)
-    if noise is not None:
-        gyro += random.normal(size=gyro.shape) * noise.gyro
-    write_csv(folder / "imu.csv", IMU_HEADER, np.column_stack([t, gyro]))
+def write_imu(folder: Path, t: np.ndarray, gyro: np.ndarray, noise: Noise) -> None:
+    """Write the gyro's yaw rate (M, 1)."""
+    write_csv(folder / "imu.csv", IMU_HEADER, np.column_stack([t, noise.on(gyro, "gyro")]))
 
 
-def write_encoder(
-    folder: Path, t: np.ndarray, latency: float, angles: np.ndarray, noise: SensorNoise | None,
-    random: np.random.Generator,
-) -> None:  # fmt: skip
-    """Write the wheel angles (M, 2) and the vehicle's counter, with noise unless it is None."""
-    angles = np.array(angles, float)
-    if noise is not None:
-        angles += random.normal(size=angles.shape) * noise.encoder
-    write_csv(folder / "encoder.csv", ENCODER_HEADER, encoder_table(t, latency, angles))
+def write_encoder(folder: Path, t: np.ndarray, latency: float, angles: np.ndarray, noise: Noise) -> None:
+    """Write the wheel angles (M, 2) and the vehicle's counter."""
+    write_csv(folder / "encoder.csv", ENCODER_HEADER, encoder_table(t, latency, noise.on(angles, "encoder")))
 
 
 def write_fields(

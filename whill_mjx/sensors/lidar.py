@@ -71,7 +71,7 @@ class Lidar(Sensor):
 
 
 def distances(
-    x: jax.Array, y: jax.Array, angles: jax.Array, boxes: Boxes, reach: float, low: float, high: Any
+    x: jax.Array, y: jax.Array, angles: jax.Array, boxes: Boxes, reach: float, heights: tuple[float, Any]
 ) -> jax.Array:
     """(R,) m from a place to the first box in each direction, at most `reach`.
 
@@ -80,8 +80,9 @@ def distances(
         angles: (R,) rad in the room.
         boxes: what they meet.
         reach: largest distance [m].
-        low, high: heights [m]; boxes that end below `low` or begin at `high` or above are not met.
+        heights: from where to where [m]; boxes that end below the first or begin at the second or above are not met.
     """
+    low, high = heights
     turn = angles[:, None] - boxes.yaw  # (R, P): direction in each box's frame
     dx, dy = x - boxes.centre[:, 0], y - boxes.centre[:, 1]
     c, s = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)

@@ -60,7 +60,7 @@ def truth(env: Any, state: Any) -> jax.Array:
 
 def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:
     """(RAYS,) m from the footprint's centre to the first box in each direction of ANGLES, at most RANGE."""
-    return distances(body.x, body.y, body.yaw + ANGLES, boxes, RANGE, 0.0, body.height)
+    return distances(body.x, body.y, body.yaw + ANGLES, boxes, RANGE, (0.0, body.height))
 
 
 def mirrored(values: jax.Array) -> jax.Array:

@@ -211,8 +211,9 @@ def goal_position(scene: Scene) -> jax.Array:
 
 
 def scale_action(task: Task, action: jax.Array) -> jax.Array:
-    """Command (2,) of v [m/s] and omega [rad/s] for an action (2,), clipped to [-1, 1]; standstill where one is NaN."""
-    stands = jnp.isnan(action).any()
-    action = jnp.clip(jnp.nan_to_num(action, nan=0.0, posinf=1.0, neginf=-1.0), -1.0, 1.0)
+    """Command (2,) of v [m/s] and omega [rad/s] for an action (2,), clipped to [-1, 1]; standstill where one is NaN or
+    infinite."""
+    stands = ~jnp.isfinite(action).all()
+    action = jnp.clip(jnp.nan_to_num(action), -1.0, 1.0)
     v = task.v_min + (action[0] + 1.0) / 2.0 * (task.v_max - task.v_min)
     return jnp.where(stands, 0.0, jnp.stack([v, action[1] * task.omega_max]))

@@ -30,6 +30,8 @@ class VehicleConfig:
             raise ValueError(
                 f"physics_dt {self.physics_dt} does not divide control_dt {self.control_dt}; choose e.g. 0.005 and 0.1."
             )
+        if self.kernel not in (None, True, False):
+            raise ValueError(f"kernel is {self.kernel!r}; it must be True, False or None. Leave it out for None.")
         if self.dynamics not in ("fused", "mjx"):
             raise ValueError(f"dynamics is {self.dynamics!r}; it must be 'fused' or 'mjx'. Leave it out for 'fused'.")
 

@@ -18,6 +18,8 @@ from whill_mjx.world.solids import Rounds
 
 TRACES = 64
 """Steps of the sphere tracing."""
+FARTHEST = 100.0
+"""Longest ray that is traced [m]."""
 CLOSE = 1e-3
 """Distance at which a traced ray has arrived [m]."""
 
@@ -57,7 +59,7 @@ def disturbed(
 
 
 def first_hits(
-    scene: Scene, x, y, angle: jax.Array, height: float, field: DistanceField | None = None, farthest: float = jnp.inf
+    scene: Scene, x, y, angle: jax.Array, height: float, field: DistanceField | None = None
 ) -> jax.Array:
     """(R,) m: how far the first thing is along each ray, inf without one.
 
@@ -66,7 +68,7 @@ def first_hits(
         x, y: (R,) or () where each ray begins [m].
         angle: (R,) direction in the world [rad].
         height: of the plane [m].
-        field: followed as well, up to `farthest`.
+        field: followed as well.
     """
     x, y = jnp.broadcast_to(x, angle.shape), jnp.broadcast_to(y, angle.shape)
     boxes, walls = scene.boxes, scene.walls
@@ -82,7 +84,7 @@ def first_hits(
         way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(angle.shape)], -1)
         nearest = jnp.minimum(nearest, round_hits(scene.solids.rounds, origin, way).min(-1, initial=jnp.inf))
     if field is not None:
-        nearest = jnp.minimum(nearest, trace(field, x, y, angle, farthest))
+        nearest = jnp.minimum(nearest, trace(field, x, y, angle))
     return nearest
 
 
@@ -137,13 +139,13 @@ def round_hits(rounds: Rounds, origin: jax.Array, way: jax.Array) -> jax.Array:
     return jnp.where(rounds.mask, nearest, jnp.inf)
 
 
-def trace(field: DistanceField, x, y, angle, farthest) -> jax.Array:
-    """(R,) m along each ray until the field's distance is nothing, inf beyond `farthest`."""
+def trace(field: DistanceField, x, y, angle) -> jax.Array:
+    """(R,) m along each ray until the field's distance is nothing, inf beyond FARTHEST."""
     c, s = jnp.cos(angle), jnp.sin(angle)
 
     def one_step(_, gone):
         free = distance_at(field, jnp.stack([x + gone * c, y + gone * s], -1))
-        return jnp.where(free > CLOSE, jnp.minimum(gone + free, farthest + 1.0), gone)
+        return jnp.where(free > CLOSE, jnp.minimum(gone + free, FARTHEST + 1.0), gone)
 
     gone = jax.lax.fori_loop(0, TRACES, one_step, jnp.zeros(angle.shape))
-    return jnp.where(gone <= farthest, gone, jnp.inf)
+    return jnp.where(gone <= FARTHEST, gone, jnp.inf)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.io.fields import Field, check, parameter_field
 from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 from whill_mjx.world.scene import Scene
 
@@ -56,14 +58,19 @@ def with_parameter(params: VehicleParams, name: str, value: jax.Array, relative:
     ))
 
 
-def check_parameter(where: str, name: str) -> None:
-    """Raise ValueError unless `name` is EFFECT.PARAMETER or body.PARAMETER; names what is known."""
+def check_parameter(where: str, name: str, values: Iterable[float], relative: bool) -> None:
+    """Raise ValueError unless `name` is EFFECT.PARAMETER or body.PARAMETER that may take these values, or factors."""
     holder, _, field = name.partition(".")
     if holder != "body" and holder not in EFFECTS:
         raise ValueError(f"{where}: no effect {holder!r} (known: body, {', '.join(sorted(EFFECTS))}).")
     known = parameters_of(Body if holder == "body" else EFFECTS[holder])
     if field not in known:
         raise ValueError(f"{where}: {holder} has no parameter {field!r} (known: {', '.join(known)}).")
+    about = known[field]
+    allowed = (Field("factor", "-", 1e-3 if holder == "body" else 0.0, 1e3, remedy="1x changes nothing.") if relative
+               else parameter_field(name, about.unit, about.low, about.high, about.neutral))
+    for value in values:
+        check(where, allowed, value)
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,7 @@ def read_variation(text: str) -> Variation:
     except ValueError:
         raise ValueError(f"{text!r} is no variation: write EFFECT.PARAMETER=LOW:HIGH or body.PARAMETER=0.9x:1.1x, the "
                          "lower bound first.") from None
-    check_parameter(f"variation {text!r}", name)
+    check_parameter(f"variation {text!r}", name, bounds, relative)
     return Variation(name, *bounds, relative)
 
 

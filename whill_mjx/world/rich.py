@@ -189,7 +189,7 @@ def _things(draw: _Draws, room: Room, marker: Marker, lone: bool) -> tuple[Boxes
     mask = draw.chance(0.55, n)
     start = jnp.abs(x) < 0.8 + half_x
     mask &= ~(start & (deep > 0.25)) & (jnp.abs(x - marker.position[0]) > 0.3 + half_x)
-    mask &= _leaves_passage(room, x, half_x, side, deep, mask, lone)
+    mask &= _leaves_passage(room, x, half_x, side, deep, lone)
     centre = jnp.stack([x, y, high / 2], 1)
     half = jnp.stack([half_x, deep / 2, high / 2], 1)
     zero, white = jnp.zeros(n), jnp.ones((THINGS, 3))
@@ -209,7 +209,7 @@ def _things(draw: _Draws, room: Room, marker: Marker, lone: bool) -> tuple[Boxes
     return boxes, rounds, top
 
 
-def _leaves_passage(room: Room, x, half_x, side, deep, mask, lone: bool) -> jax.Array:
+def _leaves_passage(room: Room, x, half_x, side, deep, lone: bool) -> jax.Array:
     """(THINGS,) bool: does a wide way lead past the obstacles and these things? Any two things leave it elsewhere."""
     obstacles = room.obstacles
     c, s = jnp.abs(jnp.cos(obstacles.yaw)), jnp.abs(jnp.sin(obstacles.yaw))
@@ -275,13 +275,13 @@ def _on_walls(draw: _Draws, room: Room, tall) -> list[Boxes]:
     doors = []
     for i in range(n):
         for thick, grow in ((0.015, 0.06), (0.02, 0.0)):
-            doors.append(_flat(x[i], side[i] * room.half_width, (high[i] + grow) / 2, wide[i] + grow,
-                               (high[i] + grow) / 2, thick, mask[i]))  # fmt: skip
+            middle = (high[i] + grow) / 2
+            doors.append(_flat((x[i], side[i] * room.half_width, middle), (wide[i] + grow, thick, middle), mask[i]))
     n = POSTERS
     x, side = draw(room.begin + 0.4, room.end - 0.4, (n,)), jnp.where(draw.chance(0.5, (n,)), 1.0, -1.0)
     wide, high, z = draw(0.1, 0.5, (n,)), draw(0.1, 0.5, (n,)), draw(0.9, 1.8, (n,))
     mask = draw.chance(0.6, (n,)) & (z + high < tall)
-    posters = [_flat(x[i], side[i] * room.half_width, z[i], wide[i], high[i], 0.01, mask[i]) for i in range(n - 1)]
+    posters = [_flat((x[i], side[i] * room.half_width, z[i]), (wide[i], 0.01, high[i]), mask[i]) for i in range(n - 1)]
     on_far = Boxes(
         jnp.stack([room.end, draw(-0.8, 0.8), z[-1]])[None], jnp.stack([jnp.asarray(0.01), wide[-1], high[-1]])[None],
         jnp.zeros(1), jnp.ones((1, 3)), mask[-1:],
@@ -289,15 +289,14 @@ def _on_walls(draw: _Draws, room: Room, tall) -> list[Boxes]:
     n = WINDOWS
     x, side = draw(room.begin + 0.5, room.end - 0.5, (n,)), jnp.where(draw.chance(0.5, (n,)), 1.0, -1.0)
     wide, high, mask = draw(0.3, 0.8, (n,)), draw(0.3, 0.6, (n,)), draw.chance(0.3, (n,)) & (tall > 2.2)
-    windows = [_flat(x[i], side[i] * room.half_width, 1.5, wide[i], high[i], 0.012, mask[i]) for i in range(n)]
+    windows = [_flat((x[i], side[i] * room.half_width, 1.5), (wide[i], 0.012, high[i]), mask[i]) for i in range(n)]
     return [*doors, *posters, on_far, *windows]
 
 
-def _flat(x, y, z, half_x, half_z, thick: float, mask) -> Boxes:
-    """One thin upright box on a side wall."""
-    centre = jnp.stack([x, y, jnp.asarray(z, float)])[None]
-    half = jnp.stack([half_x, jnp.asarray(thick), half_z])[None]
-    return Boxes(centre, half, jnp.zeros(1), jnp.ones((1, 3)), jnp.asarray(mask)[None])
+def _flat(centre: tuple, half: tuple, mask) -> Boxes:
+    """One thin upright box on a side wall, by its centre and its half edges (3,) [m]."""
+    where, size = (jnp.stack([jnp.asarray(one, float) for one in three])[None] for three in (centre, half))
+    return Boxes(where, size, jnp.zeros(1), jnp.ones((1, 3)), jnp.asarray(mask)[None])
 
 
 PROPERTIES = ("value", "saturation", "second", "cell_s", "cell_t", "shift", "joint", "joint_tone", "tone", "fill",

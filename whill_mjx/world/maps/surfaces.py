@@ -53,8 +53,10 @@ def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0)
     try:
         points, faces = _npy(data) if ending == ".npy" else _pcd(data) if ending == ".pcd" else _by_trimesh(path, data)
     except Exception as error:  # whatever a library says of a damaged file
-        reason = str(error).strip().splitlines()
-        raise ValueError(f"{path}: cannot be read as {ending} ({type(error).__name__}: "
+        no_text = isinstance(error, ModuleNotFoundError) and error.name != "trimesh"  # it would guess an encoding
+        reason = ["neither binary nor UTF-8"] if no_text else str(error).strip().splitlines()
+        what = "damaged" if no_text else type(error).__name__
+        raise ValueError(f"{path}: cannot be read as {ending} ({what}: "
                          f"{(reason or ['no reason given'])[0][:160].rstrip('.')}). Export it again.") from None
     points = np.asarray(points, float)[:, :3] * scale
     if faces is None:
