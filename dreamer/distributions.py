@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dreamer.recurrence import keep
+
 
 def symlog(x: jax.Array) -> jax.Array:
     """sign(x) * log(1 + |x|)."""
@@ -60,7 +62,7 @@ def bernoulli_loss(logit: jax.Array, target: jax.Array) -> jax.Array:
 
 def unimix_probs(logits: jax.Array, unimix: float) -> jax.Array:
     """Probabilities (..., S, C) of logits (..., S, C) with a uniform share mixed in."""
-    probs = jax.nn.softmax(logits.astype(jnp.float32), -1)
+    probs = keep(jax.nn.softmax(logits.astype(jnp.float32), -1))
     return (1.0 - unimix) * probs + unimix / logits.shape[-1]
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from dreamer.convolution import block_max, conv
+from dreamer.recurrence import keep
 from dreamer.types import Params
 
 NORM_EPS = 1e-4
@@ -76,7 +77,7 @@ def block_product(x: jax.Array, weight: jax.Array) -> jax.Array:
 def norm_act(x: jax.Array, scale: jax.Array) -> jax.Array:
     """SiLU(RMSNorm(x)) over the last axis; computed in float32, returned in the type of x."""
     wide = x.astype(jnp.float32)
-    root = jax.lax.rsqrt(jnp.mean(jnp.square(wide), -1, keepdims=True) + NORM_EPS)
+    root = keep(jax.lax.rsqrt(jnp.mean(jnp.square(wide), -1, keepdims=True) + NORM_EPS))
     return jax.nn.silu(wide * root * scale.astype(jnp.float32)).astype(x.dtype)
 
 

@@ -2,7 +2,8 @@
 
 Differentiating an ordinary scan adds a weight gradient at every step of the backward pass: T small products and T
 read-modify-writes of every weight. Here the backward scan only returns the cotangent of each product, and the weight
-gradient is one product over T * B rows, accumulated in float32.
+gradient is one product over T * B rows, accumulated in float32. Of each step the backward pass keeps what `keep` marks,
+results of products and of sums, and computes the rest again: that is cheaper than writing and reading it.
 """
 
 from __future__ import annotations
@@ -14,9 +15,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 
+KEPT = "kept"
+"""Name of what `keep` marks."""
 Tree = Any
 Step = Callable[[dict[str, jax.Array], Tree, dict[str, jax.Array], Tree], tuple[Tree, Tree, dict[str, jax.Array]]]
+
+
+def keep(x: jax.Array) -> jax.Array:
+    """`x`, which the backward pass of `scan_products` reads instead of computing it again."""
+    return checkpoint_name(x, KEPT)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -56,8 +65,10 @@ def _run(
 def _forward(
     step: Step, unroll: int, weights: dict[str, jax.Array], carry: Tree, terms: dict[str, jax.Array], inputs: Tree
 ) -> tuple[Any, Any]:
+    lean = jax.checkpoint(step, prevent_cse=False, policy=jax.checkpoint_policies.save_only_these_names(KEPT))
+
     def run(carry: Tree, terms: dict[str, jax.Array]) -> tuple[Any, dict[str, jax.Array]]:
-        return _run(step, unroll, weights, carry, terms, inputs)
+        return _run(lean, unroll, weights, carry, terms, inputs)
 
     result, pullback, operands = jax.vjp(run, carry, terms, has_aux=True)
     return result, (pullback, operands, weights, inputs)

@@ -14,7 +14,7 @@ from flax import struct
 from dreamer import distributions as dist
 from dreamer import nets
 from dreamer.config import DreamerConfig
-from dreamer.recurrence import scan_products
+from dreamer.recurrence import keep, scan_products
 from dreamer.types import Params
 
 
@@ -215,13 +215,13 @@ def _observe_body(
     h = config.hidden
     deter, stoch, deter_product = (jnp.where(inputs["is_first"], jnp.zeros_like(x), x) for x in carry)
     from_deter = nets.norm_act(deter_product + terms["in_deter_bias"], terms["in_deter_scale"])
-    from_stoch = nets.norm_act(stoch @ weights["in_stoch"] + terms["in_stoch"], terms["in_stoch_scale"])
+    from_stoch = nets.norm_act(keep(stoch @ weights["in_stoch"] + terms["in_stoch"]), terms["in_stoch_scale"])
     operand = _core_operand(config, deter, jnp.concatenate([from_deter, from_stoch], -1))
-    wide = nets.block_product(operand, weights["core"]) + terms["core"]
+    wide = keep(nets.block_product(operand, weights["core"]) + terms["core"])
     wide = _blocks(config, nets.norm_act(wide.reshape(deter.shape), terms["core_scale"]))
-    gates = nets.block_product(wide, weights["gates"]) + terms["gates"]
+    gates = keep(nets.block_product(wide, weights["gates"]) + terms["gates"])
     deter = gru(config, deter, gates)
-    products = deter @ weights["deter"] + terms["deter"]
+    products = keep(deter @ weights["deter"] + terms["deter"])
     hidden = nets.norm_act(products[:, h:], terms["post_scale"])
     logits = hidden @ weights["post_logit"] + terms["post_logit"]
     probs = dist.unimix_probs(to_logits(config, logits), config.unimix)

@@ -62,7 +62,9 @@ CLAIMS = (
         "undeclared",
         "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
         "it. 1x is the "
-        'size that 80 % of all logs would notice. "Right": the name or a member of its class.',
+        'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns 2x and 4x '
+        "are of the present decision, on 3 and 10 logs, and 6 and 4 beyond the catalogue. The others are of the "
+        "decision before it.",
         ("figure", "2x", "4x", "2x, twice the noise", "4x, twice the noise", "4x, heavy scooter"),
         tuple(
             (
@@ -86,7 +88,8 @@ CLAIMS = (
         MISSING,
         "False alarms and other checks of the verdict",
         "undeclared",
-        "The same logs.",
+        "The same logs. False alarms, p-values and effects taken out of the catalogue are of the decision before the "
+        "present one, which judged 13 logs with two effects.",
         ("figure", "value"),
         (
             (
@@ -95,15 +98,18 @@ CLAIMS = (
             ),
             ("false alarms on 200 refitted simulated days of one log", "{refitted_null_alarms}"),
             ("Kolmogorov-Smirnov p-value of the calibrated p-values (uniform if large)", "{null_ks_p}"),
-            ("two effects at once: both named right, 90 logs", "{pair_both|%}"),
-            ("the same where both are at least at 2x, 58 logs", "{pair_both_2x|%}"),
-            ("two effects at once: a wrong name, 90 logs", "{pair_wrong|%}"),
+            ("two effects at once: both named right, 13 logs", "{pair_both|%}"),
+            ("the same where both are at least at 2x, 6 logs", "{pair_both_2x|%}"),
+            ("two effects at once: a wrong name, 13 logs", "{pair_wrong|%}"),
             ("effect taken out of the catalogue, 26 logs: `unexplained`", "{left_out_unexplained|%}"),
             ("the same: named outside its class", "{left_out_outside_class|%}"),
             ("the same: named wrong without a warning", "{left_out_wrong|%}"),
-            ("95 % intervals that hold the planted size, of 80", "{interval_coverage|%}"),
+            ("95 % intervals that hold the planted size, of 5", "{interval_coverage|%}"),
             ("error of the size, median", "{parameter_error|%}"),
             ("held-out error after naming, over the replicates' difference", "{heldout_ratio}"),
+            ("numbers that decide", "{decision_thresholds}"),
+            ("lines of code between kept evidence and verdict", "{decision_lines}"),
+            ("verdict from kept evidence, milliseconds", "{verdict_s|1000}"),
         ),
     ),
     Claim(
@@ -111,7 +117,7 @@ CLAIMS = (
         "Sensors and floor noisier or quieter than on the reference days",
         "undeclared",
         "Disturbances and sensor noise of the log times a factor; the reference days keep the usual ones. 40 logs with "
-        "nothing missing for each factor.",
+        "nothing missing for each factor, judged by the decision before the present one.",
         ("figure", "0.5", "2", "4"),
         (
             (

@@ -110,6 +110,7 @@ def test_what_stands_beside_an_effect_without_a_name_has_one():
     found = verdict((0.0, 0.0, 1.0, 0.4), wheels=False)
     assert named(found) == ("named", ["command_scale"]) and "side_force stands out" in found.reason
     assert [one.effect for one in found.final.hypotheses] == ["side_force", "command_scale"]
+    assert 0.05 < found.share < 0.3  # of what is explained, the larger part has no name
 
 
 @pytest.mark.parametrize(("gains", "result"), [

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sysid.errors.noise import BIN_SHIFT
 from sysid.logs.records import Command, OdometryStream, Start, Trial
 from sysid.missing.days import alike
 
@@ -21,6 +22,8 @@ def step(v, omega, shift=0.0, start=(0.0, 0.0), shape=None):
     (step(-2.49, -0.10), True),
     (step(-2.60, -0.11), True),  # 5 and 10 % larger
     (step(-2.49, -0.10, shift=0.01), True),
+    (step(-2.49, -0.10, shift=BIN_SHIFT), True),
+    (step(-2.49, -0.10, shift=1.1 * BIN_SHIFT), False),
     (step(-3.10, -2.33), False),  # both backwards and to the right, but quite another drive
     (step(-2.49, 0.0), False),
     (step(-1.2, -0.05), False),  # the same bend at half the speed
