@@ -251,6 +251,8 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
         given = {"task": options.task or world.task, "vehicle": options.vehicle or world.vehicle,
                  "size": (world.height, world.width), **(world.fields if same else {}), **changes}
     if options.robot is None:
+        if options.wheels:
+            raise ValueError("--wheels names the wheels of a robot file. Give --robot too, or leave it out.")
         return factory(**given)
     from sysid.replay.robot_online import OnlineRobot
     from whill_mjx.env import as_vehicle

@@ -35,6 +35,7 @@ class OnlineRobot:
         self._drive = RobotDrive(self.robot, {})
         self._model = self._drive.model(0, {"drive.kp": self.robot.drive_gain[0]} if self.robot.motors else {})
         self._data = mujoco.MjData(self._model)
+        self._due = 0.0  # s asked for and not yet simulated, less than a step
         self.place(0.0, 0.0, 0.0)
 
     def spec(self, base: VehicleSpec) -> VehicleSpec:
@@ -73,7 +74,10 @@ class OnlineRobot:
         """
         data, dt = self._data, float(self._model.opt.timestep)
         data.ctrl[:] = self._drive.controls(np.array([v, omega]))
-        for _ in range(max(1, round(seconds / dt))):
+        self._due += seconds
+        steps = round(self._due / dt)
+        self._due -= steps * dt
+        for _ in range(steps):
             mujoco.mj_step(self._model, data)
             speed, turn = self._drive.observe(data.qpos, data.qvel)[3:]
             x, y, yaw = self.odometry[:3]

@@ -33,13 +33,17 @@ def wheel_inertias(host: mujoco.MjModel, joint: int, radius: float, count: int) 
 def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
     """Remove actuators of the wheels that take neither a torque nor a speed, and those on tendons, a note for each."""
     notes = []
+    turned = {one.name for one in spec.tendons if any(wrap.target is not None and wrap.target.name in joints
+                                                      for wrap in one.path)}
     for one in list(spec.actuators):
         on_tendon = one.trntype == mujoco.mjtTrn.mjTRN_TENDON
         motor = one.biastype == mujoco.mjtBias.mjBIAS_NONE
         speed = one.biasprm[1] == 0 and one.biasprm[2] < 0 or one.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
         if on_tendon or (one.target in joints and not motor and not speed):
             what = f"acts on tendon {one.target}" if on_tendon else f"holds an angle of {one.target}"
-            notes.append(f"{path.name}: actuator {one.name} {what}: servos on the wheels stand in for it")
+            instead = "nothing" if on_tendon and one.target not in turned else "servos on the wheels"
+            notes.append(f"{path.name}: actuator {one.name} {what}: {instead} stands in for it"
+                         .replace("wheels stands", "wheels stand"))
             spec.delete(one)
     return notes
 

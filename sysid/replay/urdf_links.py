@@ -70,13 +70,13 @@ def _inertial(link: ElementTree.Element, name: str) -> list[str]:
 
 def _reach(link: ElementTree.Element) -> float:
     """Half of the largest size of a link's shapes [m]."""
-    sizes = [USUAL]
+    sizes = []
     for shape in link.iter("geometry"):
         for one in shape:
             stated = [float(part) for part in one.get("size", "").split()]
             sizes += [max(stated) / 2] if stated else []
-            sizes += [_number(one, "radius")] if one.get("radius") else []
-    return sizes[-1]
+            sizes += [_number(one, "radius"), _number(one, "length") / 2]
+    return max(sizes, default=0.0) or USUAL
 
 
 def _number(element: ElementTree.Element, name: str) -> float:
