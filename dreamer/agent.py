@@ -144,7 +144,7 @@ def policy_step(config: DreamerConfig, params: Params, carry: Carry, obs: Any) -
     return {name: value[0] for name, value in new_carry.items()}, action[0]
 
 
-def told(params: Params, carry: Carry) -> jax.Array:
+def believed(params: Params, carry: Carry) -> jax.Array:
     """Vectors (..., D) of `decode_only`, as they are predicted from the carry of one instance or of several."""
     features = jnp.concatenate([carry["deter"], carry["stoch"]], -1)
     return dist.symexp(sensors.decode_vector(params["dec"], features))

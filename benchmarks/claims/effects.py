@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.claims.claim import Claim, Row
 
-FIT = "Fits"
+FIT = "Logs and robots of one's own"
 MISSING = "The missing effect"
 
 

@@ -398,9 +398,9 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
         gyro = GyroStream.of_rates(now, turning[inside]) if np.isfinite(turning[inside]).all() else None
         trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run),
                             gyro=gyro))
-    told, said = with_sign(trials)
+    signed, said = with_sign(trials)
     note = "; ".join([f"{run}: {len(trials)} windows of {window:g} s during calibration phases", *said])
-    return list(told), note
+    return list(signed), note
 
 
 def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:

@@ -22,7 +22,7 @@ from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
 from sysid.verdict.found import NullRefits, PairScan, Search, tail
 from sysid.verdict.pairs import scan_again
-from sysid.verdict.posterior import Thresholds
+from sysid.verdict.posterior import Thresholds, posterior
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import best, drawn_away
 
@@ -81,6 +81,9 @@ def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresh
             and nulls.p_of(found.p_value) >= thresholds.alpha and wander.p_excess(found.excess[0]) >= thresholds.alpha):
         found.verdict, found.accepted, found.classes, found.final = "none", [], [], found.base
         found.share, found.excess = 0.0, (found.excess[0], found.excess[0])
+        if found.findings is not None:
+            found.findings = replace(found.findings, p_refit=nulls.p_of(found.p_value), sets=())
+            found.weights = posterior(found.findings, thresholds).weights
         found.reason = f"stands out no more than in {nulls.p_of(found.p_value):.1%} of simulated days without anything"
     return found
 

@@ -7,7 +7,8 @@ a saved file can be judged again, with other priors too (`python -m sysid.verdic
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from whill_mjx.io.reading import read_json
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
 KIND = "sysid-evidence"
 AGAIN = "Give evidence.json of a run of sysid.close_loop."
+WORDS = ("effects", "variants", "classes", "against", "noise")
+"""Entries of a file that hold no numbers."""
 MOST = 2
 """Effects that are named together. A third one is only tried to see whether the first stood in for two."""
 
@@ -198,6 +201,8 @@ class Posterior:
 def posterior(findings: Findings, priors: Thresholds) -> Posterior:
     """Weigh what was tried."""
     verdict, chosen, share, reason = _decide(findings, priors)
+    if verdict == "none" and not findings.sets:
+        return Posterior(verdict, chosen, share, reason, {"noise" if findings.noise else "none": 1.0})
     return Posterior(verdict, chosen, share, reason, _weights(findings, priors, chosen))
 
 
@@ -249,13 +254,12 @@ def _weights(findings: Findings, priors: Thresholds, chosen: int | None) -> dict
     `Thresholds.share`. A further effect costs log(1 / alpha).
     """
     nothing = "noise" if findings.noise else "none"
-    p = min(findings.p_refit, *(one.p_value for one in findings.sets), 1.0) if findings.sets else findings.p_refit
+    p = min([findings.p_refit, *(one.p_value for one in findings.sets)] if findings.sets
+            else [findings.p_refit, findings.p_excess(findings.excess)])
     p = min(max(p, 1e-300), np.exp(-1))
     bound = -np.e * p * np.log(p)
-    weight = bound / (1 + bound) if findings.sets else 1.0
+    weight = bound / (1 + bound)
     out = {nothing: float(weight)}
-    if not findings.sets:
-        return out
     able = {i for i, one in enumerate(findings.sets) if len(one.effects) <= MOST and findings.own(one, priors)}
     names, logs = [], []
     for i, one in enumerate(findings.sets):
@@ -301,9 +305,28 @@ def read(path: Path) -> Findings:
         raise ValueError(f"{path}: kind {shown(content.get('kind'))}, schema {shown(content.get('schema'))}; this "
                          f"program reads {KIND!r}, schema {FORMATS[KIND].schema}. {AGAIN}")
     try:
-        return from_json(content)
+        findings = from_json(content)
     except (TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path}: no evidence of a verdict ({error}). {AGAIN}") from None
+    for name, value in _numbers(asdict(findings)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ValueError(f"{path}: {name} = {shown(value)} is not a finite number. {AGAIN}")
+        if name in ("day", "count", "freedom") and value <= 0:
+            raise ValueError(f"{path}: {name} = {shown(value)} must be above 0. {AGAIN}")
+    return findings
+
+
+def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Name and value of all that must be a number: what is neither a word, None, nor a list or table of such."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            if key not in WORDS:
+                yield from _numbers(value, key)
+    elif isinstance(content, list | tuple):
+        for value in content:
+            yield from _numbers(value, name)
+    elif content is not None or name != "p_pairs":
+        yield name, content
 
 
 def write(path: Path, findings: Findings) -> None:

@@ -1,5 +1,7 @@
+
 """Parts of the closed loop on hand-made residuals: agreement, hypotheses, wander, whitening."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -193,6 +195,25 @@ def test_a_file_without_findings_is_refused_in_one_line(content, wrong, tmp_path
     with pytest.raises(ValueError, match=wrong) as refused:
         read(tmp_path / "evidence.json")
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("name", "value"), [("day", "x"), ("day", 0), ("count", float("nan")), ("excess", True)])
+def test_findings_of_other_values_are_refused_by_name(name, value, tmp_path):
+    path = tmp_path / "evidence.json"
+    write(path, findings(9.0, [tried(0.0, gain=9.0)]))
+    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+    with pytest.raises(ValueError, match=f"evidence.json: {name} = "):
+        read(path)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("excess", "p", "verdict", "largest"), [
+    (99.0, 1e-9, "unexplained", "unknown"), (0.0, 0.5, "none", "none")])
+def test_where_no_effect_was_refitted_the_weights_agree_with_the_verdict(excess, p, verdict, largest):
+    found = posterior(replace(findings(excess, [], p), p_scan=p), Thresholds())
+    assert found.verdict == verdict and max(found.weights, key=found.weights.get) == largest
+    assert sum(found.weights.values()) == pytest.approx(1.0)
 
 
 @pytest.mark.quick

@@ -133,7 +133,7 @@ def test_the_vehicle_drives_the_same_way_with_and_without_the_option():
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(commands.OwnModels):
     """Of a command that may step another model."""
 
     model: str = ""

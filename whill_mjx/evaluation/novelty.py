@@ -1,6 +1,6 @@
 """Surprise: how far what a policy believes contradicts itself, and how far it does so in the policy's own world.
 
-A world model that was told in training where the goal lies believes in each frame where it is, and how the vehicle
+A world model that has learned in training where the goal lies believes in each frame where it is, and how the vehicle
 moves. Where both are right, the goal moves backwards in the body frame as the vehicle moves ahead. In a picture that
 the model misreads it jumps.
 """

@@ -406,7 +406,7 @@ def dreamer_policy(preset: Preset, control_dt: float) -> tuple[Step, dict[str, A
     step: Step = lambda params, carry, image: agents.policy_step(learner, params, carry, image)  # noqa: E731
     carry = agents.policy_carry(learner, 2)
     if preset.looks == "rich" and TRUTH in learner.decode_only:
-        believe = lambda params, carry: privileged.UNIT * agents.told(params, carry)[:4]  # noqa: E731
+        believe = lambda params, carry: privileged.UNIT * agents.believed(params, carry)[:4]  # noqa: E731
         step, carry = watched(step, carry, seconds, believe)
     return limited_policy(preset.task, preset.safety, step, carry, seconds)
 
