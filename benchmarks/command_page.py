@@ -17,7 +17,7 @@ MORE = {
     "whill_mjx.export_mjcf": "howto/export.md", "whill_mjx.export_python": "howto/export.md",
     "whill_mjx.view": "view.md", "sysid.fit": "fit.md", "sysid.close_loop": "close_loop.md",
     "sysid.inspect": "sysid_tools.md#inspect", "sysid.convert": "sysid_tools.md#convert",
-    "sysid.design": "sysid_tools.md#design", "sysid.report": "sysid_tools.md#report",
+    "sysid.design": "sysid_tools.md#design", "sysid.verdict": "close_loop.md", "sysid.report": "sysid_tools.md#report",
     "sysid.paper": "sysid_tools.md#the-papers-experiment", "sysid.searches": "sysid_tools.md#which-search",
 }  # fmt: skip
 """Pages of the commands; those of the bridge share one."""
@@ -25,7 +25,7 @@ HEAD = """# Commands
 
 <!-- Written by python -m benchmarks.command_page. -->
 
-Each command is a Python module, and each takes `--help`. Installed, it is also a program of its own: `whill-train` is
+Each command is a Python module, and each takes `--help`. Installed, most are also programs: `whill-train` is
 `python -m whill_mjx.train`, and `sysid-close-loop` is `python -m sysid.close_loop`.
 
 ```mermaid

@@ -28,6 +28,8 @@ from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
 from bridge.simulate_node import SimulateNode
 from bridge.simulated import SCAN_HEIGHT, SCAN_RANGE, SCAN_RAYS, Frame, Grid, SimulatedVehicle
 
+SIMULATOR = "bridge.simulate:ChairSimulator"
+"""What `--simulator` names unless given."""
 TOKEN_VARIABLE = "BRIDGE_TOKEN"
 """Environment variable with the token of episode control; on a command line everybody could read it."""
 CELL, BORDER, CELLS = 0.05, 1.0, 1000
@@ -257,6 +259,8 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     from sysid.replay.robot_online import OnlineRobot
     from whill_mjx.env import as_vehicle
 
+    if options.simulator != SIMULATOR:
+        raise ValueError(f"--robot {options.robot} is driven by a simulator of its own. Leave --simulator out.")
     robot = OnlineRobot(options.robot, options.wheels or ())
     given["vehicle"] = robot.spec(as_vehicle(given["vehicle"])[0])
     moved: Any = MovedSimulator(robot, **given)
@@ -308,7 +312,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--command-type", choices=("Twist", "TwistStamped"), default="Twist")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
                         help="SCHED_FIFO priority, like 20")
-    parser.add_argument("--simulator", default="bridge.simulate:ChairSimulator", metavar="MODULE:FACTORY")
+    parser.add_argument("--simulator", default=SIMULATOR, metavar="MODULE:FACTORY")
     return parser.parse_args(arguments)
 
 

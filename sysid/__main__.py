@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-COMMANDS = ("inspect", "convert", "fit", "close_loop", "design", "paper", "searches", "report")
+COMMANDS = ("inspect", "convert", "fit", "close_loop", "design", "paper", "searches", "report", "verdict")
 
 
 def first_line(name: str) -> str:
     """The first line of a command's docstring, without what follows a colon."""
-    source = (Path(__file__).parent / f"{name}.py").read_text(encoding="utf-8")
+    here = Path(__file__).parent
+    file = here / f"{name}.py"
+    source = (file if file.exists() else here / name / "__main__.py").read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0].split(": `")[0].rstrip(".")
 
 
