@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -231,8 +232,8 @@ def drive_slowly() -> int:
             time.sleep(SLOW_STEP)
         return step(policy, image)
 
-    Policy.step = slow  # type: ignore[assignment, method-assign]
-    return drive.main()
+    with mock.patch.object(Policy, "step", slow):
+        return drive.main()
 
 
 if __name__ == "__main__":

@@ -129,5 +129,7 @@ def test_public_names_can_be_imported_and_others_are_refused_by_name(package):
 def test_python_m_package_lists_its_commands(package):
     said = subprocess.run([sys.executable, "-m", package], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     listed = re.findall(rf"python -m ({package}\.\w+) +(\S.*)", said)
-    assert all((ROOT / name.replace(".", "/")).with_suffix(".py").exists() for name, _ in listed)
+    files = [(path.with_suffix(".py"), path / "__main__.py") for name, _ in listed
+             for path in [ROOT / name.replace(".", "/")]]
+    assert all(module.exists() or package_.exists() for module, package_ in files)
     assert listed or package == "dreamer"

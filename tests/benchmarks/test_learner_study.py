@@ -41,7 +41,7 @@ def observed(form):
     params, start, args = sequences(CONFIG, 2)
 
     def total(params):
-        states, probs = rssm.observe(CONFIG, params, start, *args)
+        states, probs = rssm.observe(CONFIG, params, start, rssm.Sequences(*args))
         weight = jax.random.normal(jax.random.PRNGKey(2), probs.shape)
         return jnp.sum(weight * probs) + jnp.sum(jnp.square(states.features())), (states, probs)
 
@@ -65,10 +65,10 @@ def test_the_fused_kernel_gives_the_states_of_the_scan():
     config = preset("cpu", deter=64, hidden=16, stoch=2, classes=16, blocks=2, batch_size=16)
     params, start, args = sequences(config, 16)
     params = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.PRNGKey(x.size), x.shape), params)
-    scanned = rssm.observe(config, params, start, *args)
+    scanned = rssm.observe(config, params, start, rssm.Sequences(*args))
     alone = learner_fused.fused_scan(learner_fused.Layout(alone=True))
     with mock.patch.object(rssm, "scan_products", alone):
-        fused = rssm.observe(config, params, start, *args)
+        fused = rssm.observe(config, params, start, rssm.Sequences(*args))
     for one, other in zip(jax.tree.leaves(scanned), jax.tree.leaves(fused), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
 
@@ -78,7 +78,7 @@ def test_widths_that_the_fused_kernel_cannot_have_are_refused():
     params, start, args = sequences(config, 16)
     with mock.patch.object(rssm, "scan_products", learner_fused.fused_scan(learner_fused.Layout(alone=True))):
         with pytest.raises(ValueError, match="deter is 48"):
-            rssm.observe(config, params, start, *args)
+            rssm.observe(config, params, start, rssm.Sequences(*args))
 
 
 def test_an_instruction_counts_for_the_outermost_part_that_asked_for_it():

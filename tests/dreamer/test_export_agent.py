@@ -68,7 +68,7 @@ def test_the_network_has_an_input_for_each_seen_observation_and_none_for_a_targe
     table = json.loads((path / "policy.json").read_text())
     assert table["onnx"]["inputs"] == list(inputs) and table["onnx"]["outputs"] == outputs
     assert set(table["files"]) == {"policy.onnx", "weights.npz"} and table["task"] == "toy"
-    assert table["parity"]["max_abs_action_difference"] <= 1e-5 and table["parity"]["steps"] == 50
+    assert table["parity"]["max_abs_action_difference"] <= 1e-5 and table["parity"]["steps"] == 200
     if name == "vector":
         assert seen == {"observation": ("tensor(float)", (5,))} and outputs[:2] == ["action", "next_deter"]
         assert table["observation"] == [5] and table["action"] == {"kind": "box", "size": 2}

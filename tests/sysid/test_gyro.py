@@ -20,7 +20,7 @@ from sysid.replay.models import function_model, set_parameters
 from sysid.replay.rollout import make_batch, predictions
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FitConfig
-from whill_mjx.logs.dataset import write_imu
+from whill_mjx.logs.dataset import Noise, write_imu
 from whill_mjx.logs.manoeuvres import Scenario
 from whill_mjx.logs.simulated_sensors import SensorNoise
 from whill_mjx.vehicle.specs import WHILL_CR
@@ -172,7 +172,7 @@ def test_imu_csv_of_a_dataset_is_read(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "log")
     for trial in (tmp_path / "log" / "trials").iterdir():
         t = np.arange(0.0, 6.0, 0.01)
-        write_imu(trial, t, np.full((len(t), 1), 0.1), None, np.random.default_rng(0))
+        write_imu(trial, t, np.full((len(t), 1), 0.1), Noise())
     trials = load_log(tmp_path / "log").trials
     assert all(trial.gyro is None for trial in trials)  # it turns as the vehicle never did
     (trial / "imu.csv").write_text("t,gyro\n0,0\n0,1\n")

@@ -63,10 +63,9 @@ def test_corridor_has_the_papers_limits_and_no_smoothness_term():
 def test_course_actions_cover_one_metre_per_second_both_ways_and_bad_ones_are_tamed():
     course = ObstacleCourse()
     np.testing.assert_allclose(scale_action(course, jnp.array([-3.0, 2.0])), [-1.0, 1.0])
-    for bad in ([jnp.nan, 0.5], [0.5, jnp.nan]):
+    for bad in ([jnp.nan, 0.5], [0.5, jnp.nan], [jnp.inf, -jnp.inf]):
         np.testing.assert_allclose(scale_action(course, jnp.array(bad)), [0.0, 0.0])
         np.testing.assert_allclose(scale_action(Corridor(), jnp.array(bad)), [0.0, 0.0])
-    np.testing.assert_allclose(scale_action(course, jnp.array([jnp.inf, -jnp.inf])), [1.0, -1.0])
 
 
 @pytest.mark.parametrize(("field", "value"), [("v_max", float("nan")), ("omega_max", "x"), ("max_steps", 1.5),
