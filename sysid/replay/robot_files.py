@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from sysid.replay import xacro_text
-from sysid.replay.urdf_links import complete_links
+from sysid.replay.urdf_links import compiler_of, complete_links
 from sysid.replay.xacro_text import around, package_folders
 from whill_mjx.io.reading import LONGEST_REASON, MB, decoded, read_bytes
 
@@ -150,11 +150,7 @@ def _place_urdf_meshes(
                     shape = _stand_in(link, element, geometry, axles.get(link.get("name")), wheel_radius)
                     notes.append(f"{path.name}: mesh {name} of link {link.get('name')} is not found, or MuJoCo cannot "
                                  f"read it; {shape} stands in for it")
-    options = top.find("mujoco")
-    options = ElementTree.SubElement(top, "mujoco") if options is None else options
-    compiler = options.find("compiler")
-    compiler = ElementTree.SubElement(options, "compiler") if compiler is None else compiler
-    compiler.set("strippath", "false")
+    compiler_of(top).set("strippath", "false")
     return notes
 
 

@@ -33,12 +33,17 @@ def complete_links(path: Path, top: ElementTree.Element) -> list[str]:
                 link.append(shape)
             notes.append(f"{path.name}: link {name} has no collision shape: its visible one touches instead")
         notes += [f"{path.name}: {one}" for one in _inertial(link, name)]
+    compiler_of(top).set("balanceinertia", "true")
+    return notes
+
+
+def compiler_of(top: ElementTree.Element) -> ElementTree.Element:
+    """MuJoCo's options of a URDF, made where the file has none."""
     options = top.find("mujoco")
     options = ElementTree.SubElement(top, "mujoco") if options is None else options
     compiler = options.find("compiler")
     compiler = ElementTree.SubElement(options, "compiler") if compiler is None else compiler
-    compiler.set("balanceinertia", "true")
-    return notes
+    return compiler
 
 
 def _inertial(link: ElementTree.Element, name: str) -> list[str]:
