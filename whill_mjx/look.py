@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -76,10 +77,20 @@ class Look:
 
 def contact_sheet(env: Env, params: VehicleParams, worlds: int, steps: int, seed: int = 0) -> np.ndarray:
     """Sheet (rows, columns, 3) uint8 of `worlds` worlds, at the size of the camera image."""
-    draw = jax.jit(jax.vmap(lambda key: _column(env, params, key, steps)))
-    pictures = draw(jax.random.split(jax.random.key(seed), worlds))
-    columns = [np.concatenate([np.asarray(picture[world]) for picture in pictures]) for world in range(worlds)]
-    return np.concatenate(columns, axis=1)
+    keys = jax.vmap(partial(jax.random.split, num=3))(jax.random.split(jax.random.key(seed), worlds))
+    reset_keys, plan_keys, drive_keys = keys.T
+    reset = jax.jit(jax.vmap(partial(reset_state, env, params))).trace(reset_keys)
+    see = jax.jit(jax.vmap(partial(observe, env))).trace(reset.out_info)
+    drive = jax.jit(jax.vmap(partial(_drive, env, params, steps=steps))).trace(reset.out_info, plan_keys, drive_keys)
+    above = jax.jit(jax.vmap(partial(top_view, env))).trace(*drive.out_info)
+    with ThreadPoolExecutor() as threads:  # XLA compiles without holding Python's lock
+        programs = [threads.submit(one.lower().compile) for one in (drive, see, above, reset)]
+    run_drive, run_see, run_above, run_reset = (one.result() for one in programs)
+    start = run_reset(reset_keys)
+    later, path = run_drive(start, plan_keys, drive_keys)
+    rows = [np.concatenate(np.asarray(images), axis=1) for images in (
+        run_see(start), run_see(later), run_above(later, path))]  # fmt: skip
+    return np.concatenate(rows)
 
 
 def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array:
@@ -109,10 +120,11 @@ def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array
     return render(eye, down, intrinsics, scene, height, width)
 
 
-def _column(env: Env, params: VehicleParams, key: jax.Array, steps: int) -> tuple[jax.Array, ...]:
+def _drive(
+    env: Env, params: VehicleParams, start: State, plan_key: jax.Array, drive_key: jax.Array, steps: int
+) -> tuple[State, jax.Array]:
+    """State of one instance after `steps` control periods of the planner, and about twelve points (T, 2) of its way."""
     config = for_task(env.task)
-    reset_key, plan_key, drive_key = jax.random.split(key, 3)
-    start = reset_state(env, params, reset_key)
 
     def one_step(carry, step_key):
         state, plan = carry
@@ -122,7 +134,7 @@ def _column(env: Env, params: VehicleParams, key: jax.Array, steps: int) -> tupl
 
     plan = first_plan(config, env, start, plan_key)
     (later, _), path = jax.lax.scan(one_step, (start, plan), jax.random.split(drive_key, steps))
-    return observe(env, start), observe(env, later), top_view(env, later, path[:: max(1, steps // 12)])
+    return later, path[:: max(1, steps // 12)]
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
