@@ -81,7 +81,7 @@ class Benchmark:
     only: tuple[str, ...] = ()
     """Only logs with these effects, of those from `base` and `scales`."""
     labels: tuple[str, ...] = ()
-    """Only logs of these names, of all that the other options ask for."""
+    """Only logs of these names, in this order, of all that the other options ask for."""
     full: Annotated[int, COUNT] = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -162,10 +162,8 @@ def plant(settings: Benchmark) -> None:
 
     def judge(listed: Sequence[contact.Job]) -> None:
         for number, job in enumerate(listed):
-            if settings.labels and job.label not in settings.labels or (
-                    work / "verdicts" / f"{job.label}.json").exists():
-                continue
-            if settings.share and not contact.claimed(work, job.label):
+            if (work / "verdicts" / f"{job.label}.json").exists() or (
+                    settings.share and not contact.claimed(work, job.label)):
                 continue
             if job.reference not in ready:
                 ready.clear()  # one at a time: each has its compiled replay
@@ -175,23 +173,29 @@ def plant(settings: Benchmark) -> None:
             print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
 
-    nulls = contact.null_jobs(settings.nulls, part, settings.reference_sets)
-    judge(sorted(nulls, key=lambda job: job.reference))
-    judge(contact.own_set_jobs(settings.own_sets, part))
     while settings.base and (listed := contact.probe_jobs(work, part, settings.only)):
         judge(listed)
+    judge(wanted(settings))
+    if part == "1/1" and not settings.share:
+        undeclared_figures.figures(work, driven)
+
+
+def wanted(settings: Benchmark) -> list[contact.Job]:
+    """The logs that were asked for, in the order in which they are judged."""
+    work, part, driven = settings.work / "plant", settings.part, settings.driven
+    nulls = contact.null_jobs(settings.nulls, part, settings.reference_sets)
+    listed = sorted(nulls, key=lambda job: job.reference) + contact.own_set_jobs(settings.own_sets, part)
     if settings.scales:
-        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only))
+        listed += contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only)
     if settings.sensor_noise:
         usual = contact.scaled_jobs(work, (4.0,), settings.seeds, "1/1", driven, settings.only)
         usual += contact.pair_jobs(work, settings.noisy_pairs, "1/1", driven)
-        judge(contact.noisy_jobs(usual, settings.sensor_noise, settings.noisy_nulls, part))
+        listed += contact.noisy_jobs(usual, settings.sensor_noise, settings.noisy_nulls, part)
     if settings.left_out:
-        judge(contact.left_out_jobs(work, part))
-    if settings.pairs:
-        judge(contact.pair_jobs(work, settings.pairs, part, driven))
-    if part == "1/1" and not settings.share:
-        undeclared_figures.figures(work, driven)
+        listed += contact.left_out_jobs(work, part)
+    listed += contact.pair_jobs(work, settings.pairs, part, driven)
+    by_name = {job.label: job for job in listed}
+    return [by_name[label] for label in settings.labels if label in by_name] if settings.labels else listed
 
 
 def look_alikes(settings: Benchmark) -> None:
