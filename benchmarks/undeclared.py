@@ -29,6 +29,7 @@ from benchmarks import undeclared_plant as contact
 from benchmarks.harness import RESULTS, device_name, provenance
 from benchmarks.undeclared_reference import Driven, prepared, reference_days, reference_of
 from sysid.logs.log import load_log
+from sysid.missing.catalogue import Hypothesis
 from sysid.pages.loop_report import make_report, write_run
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.pipeline import find_missing
@@ -54,8 +55,8 @@ class Benchmark:
     nulls: Annotated[int, NOT_NEGATIVE] = 0
     """Logs of the contact plant with nothing in them."""
     reference_sets: Annotated[int, COUNT] = 1
-    """Sets of reference days that these are judged against in turn; all else is judged against the first. With as many
-    sets as there are processes (`part`), each makes one."""
+    """Sets of reference days that these and `noisy_nulls` are judged against in turn; all else is judged against the
+    first. With as many sets as there are processes (`part`), each makes one."""
     own_sets: Annotated[int, NOT_NEGATIVE] = 0
     """Further logs with nothing in them, each judged against a set of its own: their p-values are independent."""
     base: bool = False
@@ -190,7 +191,8 @@ def wanted(settings: Benchmark) -> list[contact.Job]:
     if settings.sensor_noise:
         usual = contact.scaled_jobs(work, (4.0,), settings.seeds, "1/1", driven, settings.only)
         usual += contact.pair_jobs(work, settings.noisy_pairs, "1/1", driven)
-        listed += contact.noisy_jobs(usual, settings.sensor_noise, settings.noisy_nulls, part)
+        listed += contact.noisy_jobs(usual, settings.sensor_noise, settings.noisy_nulls, part,
+                                     settings.reference_sets)
     if settings.left_out:
         listed += contact.left_out_jobs(work, part)
     listed += contact.pair_jobs(work, settings.pairs, part, driven)
@@ -203,7 +205,7 @@ def look_alikes(settings: Benchmark) -> None:
     from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
     from sysid.missing.drives import make_drives
     from sysid.missing.signatures import gather
-    from sysid.verdict.classes import classes, imitation
+    from sysid.verdict.classes import imitation
 
     days = reference_days(settings.work / "plant")
     content: dict[str, Any] = {"threshold": 0.9, "command": "python -m benchmarks.undeclared --classes", "sensors": {}}
@@ -222,6 +224,22 @@ def look_alikes(settings: Benchmark) -> None:
         content["sensors"][sensors] = {"classes": members,
                                        "mean_size": float(np.mean([len(each) for each in members.values()]))}
     write_json(undeclared_figures.CLASSES, content)
+
+
+def classes(
+    alike: np.ndarray, hypotheses: Sequence[Hypothesis], threshold: float = 0.9, largest: int = 4
+) -> dict[str, list[str]]:
+    """Effect -> itself and the effects that imitate it, nearest first."""
+    out: dict[str, list[str]] = {}
+    for effect in dict.fromkeys(one.effect for one in hypotheses):
+        mine = [i for i, one in enumerate(hypotheses) if one.effect == effect]
+        nearest: dict[str, float] = {}
+        for i in mine:
+            for j, other in enumerate(hypotheses):
+                if other.effect != effect and alike[i, j] > threshold:
+                    nearest[other.effect] = max(nearest.get(other.effect, 0.0), float(alike[i, j]))
+        out[effect] = [effect, *sorted(nearest, key=lambda name: -nearest[name])][:largest]
+    return out
 
 
 def write_json(path: Path, content: Any) -> None:
