@@ -46,7 +46,10 @@ def put_to_test(
             alpha = ALPHA / len(tested)
             if falsifier.kind == "absent":
                 quiet = QUIET[falsifier.by](course)[..., None] & seen
-                out[-1].append(_absent(one.effect, falsifier, fit, part, refitter.precision, quiet, p_excess, alpha))
+                gains = (_gain(moved_last(fit, number), part.stop - part.start, refitter.precision),
+                         _gain(fit, len(fit.q), refitter.precision))
+                left = fit.residual.reshape(quiet.shape)[quiet]
+                out[-1].append(_absent(one.effect, falsifier, left, gains, p_excess, alpha))
                 continue
             sides = SPLITS[falsifier.by](course, energy)
             parts = np.stack([change * (sides == which)[..., None] for which in (-1.0, 1.0, 0.0)], axis=-1)
@@ -100,18 +103,18 @@ def _same(effect: str, falsifier: Falsifier, size: np.ndarray, covariance: np.nd
 
 
 def _absent(
-    effect: str, falsifier: Falsifier, fit: Refit, part: slice, precision: np.ndarray, quiet: np.ndarray,
+    effect: str, falsifier: Falsifier, residual: np.ndarray, gains: tuple[float, float],
     p_excess: Callable[[float], float], alpha: float,
 ) -> Tested:
-    """Whether what is left in bins (B, K, C) where an effect does nothing is too much for it to be what is missing."""
-    count = float(quiet.sum())
-    left = float(np.square(fit.residual.reshape(quiet.shape)[quiet]).sum()) - count
-    gain = _gain(moved_last(fit, fit.parts.index(part)), part.stop - part.start, precision)
-    p = float(p_excess(left / count)) if count else 1.0
-    share = left / _gain(fit, len(fit.q), precision)
-    visible = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
+    """Whether the residual (N,) where an effect does nothing is too large for it to be what is missing; `gains` has by
+    how much it alone and all effects lower the cost."""
+    count = float(len(residual))
+    left = float(np.square(residual).sum()) - count
+    own, every = gains
+    p, share = float(p_excess(left / count)) if count else 1.0, left / every
+    visible = count > 0 and p_excess(own / count) < alpha  # had it all been left there, it would have been seen
     outcome = "falsified" if p < alpha and share > LEFT else "holds" if visible else "untold"
-    return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
+    return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / own), p,
                   1.0 if visible else 0.0)
 
 

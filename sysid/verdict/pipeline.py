@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from sysid import command_line
+from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER, base_values
-from sysid.missing.days import Reference
+from sysid.missing.days import Reference, Wander
 from sysid.missing.drives import make_drives
+from sysid.missing.evidence import Evidence
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
@@ -55,52 +57,76 @@ def find_missing(
     if reference is None:
         reference = reference_for(log, references, config, vehicle, progress, start)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
-    ready = ready.without(config.without)
-    reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
     fitted = time.perf_counter()
-    base = base_values(full)
-    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths, reference.gyro)
-    at = drives.simulate(np.array([base[name] for name in names])[None])[0]
-    drives = drives.weighted(at, reference.factors, log.spec.track)
-    noise = compared(drives, at, reference, config.thresholds.alpha)
-    usual, ready = ready, with_noise(ready, noise)
-    reference = ready.reference
-    evidence, slopes = gather(drives, reference, found, full, progress)
+    seen = _look(log, ready.without(config.without), config, progress)
     gathered = time.perf_counter()
-    refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
-    draws = min(config.draws, 300) if config.quick else config.draws
-
-    def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
-
-    asked = begin(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
+    asked, reference = _asked(log, seen, config, progress), seen.ready.reference
     alone = stands_alone(log.training, reference.known)
     judge: Callable[[Asked, PairScan | None], Search] = settle
     if alone:
         judge = partial(search_alone, wheels=any(trial.odometry is not None for trial in log.training))
     pairs = None if alone else pairs_of(asked, config.seed)
     outcome = judge(asked, pairs)
-    if outcome.findings is not None and noise is not None:
-        other = tuple(name for name, one in noise.report().items() if one["changed"])
+    if outcome.findings is not None and seen.noise is not None:
+        other = tuple(name for name, one in seen.noise.report().items() if one["changed"])
         outcome = outcome.judged(replace(outcome.findings, noise=other), config.thresholds)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(replace(asked, wander=usual.wander), judge, pairs, config.refit_nulls,
-                                config.seed, progress)
-        outcome = checked(outcome, nulls, ready.wander, config.thresholds)
+        usual = replace(asked, wander=seen.usual)
+        nulls = run_null_refits(usual, judge, pairs, config.refit_nulls, config.seed, progress)
+        outcome = checked(outcome, nulls, seen.ready.wander, config.thresholds)
     stood: tuple[Stood, ...] = ()
     if outcome.verdict == "named":
         # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
-        p_excess = (lambda _: 1.0) if alone else usual.wander.p_excess
-        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, p_excess))
+        p_excess = (lambda _: 1.0) if alone else seen.usual.p_excess
+        stood = tuple(stand(outcome, seen.refitter, log.training, seen.evidence.groups, log.spec.track, p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
     floor = floor_change(reference, log.training, config.thresholds.alpha)
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise, floor)
+    result = Result(log, tuple(references), config, seen.ready, outcome, seen.evidence, seconds, nulls, stood,
+                    seen.noise, floor)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What some drives show, before anything is searched for in them."""
+
+    ready: Prepared
+    """Where their noise is another one, with that noise."""
+    usual: Wander
+    """At the noise of the reference days."""
+    noise: NoiseLevels | None
+    evidence: Evidence
+    refitter: Refitter
+
+
+def _look(log: Log, ready: Prepared, config: LoopConfig, progress: Progress | None) -> Seen:
+    """Noise and signatures of the training trials."""
+    reference, names, values = ready.reference, ready.names, base_values(ready.full)
+    base = np.array([values[name] for name in names])
+    drives = make_drives(ready.plant, ready.full, names, log.training, reference.width, ready.paths, reference.gyro)
+    at = drives.simulate(base[None])[0]
+    drives = drives.weighted(at, reference.factors, log.spec.track)
+    noise = compared(drives, at, reference, config.thresholds.alpha)
+    usual, ready = ready.wander, with_noise(ready, noise)
+    evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
+    return Seen(ready, usual, noise, evidence, Refitter(drives, ready.reference, base, slopes))
+
+
+def _asked(log: Log, seen: Seen, config: LoopConfig, progress: Progress | None) -> Asked:
+    """What is searched for in the drives."""
+    reference = seen.ready.reference
+
+    def anything(residual: np.ndarray) -> float:
+        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
+
+    draws = min(config.draws, 300) if config.quick else config.draws
+    return begin(seen.evidence, seen.ready.hypotheses, seen.refitter, seen.ready.wander, config.thresholds, anything,
+                 draws, config.seed, progress)
 
 
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
