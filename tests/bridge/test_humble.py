@@ -50,10 +50,13 @@ humble_stub.install()
 import numpy as np
 from bridge import commands, drive, guard, vehicle_node
 from bridge.controller import Controller
+from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
 
 class Policy:
-    contract = types.SimpleNamespace(height=8, width=8, rate_hz=200.0, action_repeat=1)
+    contract = commands = types.SimpleNamespace(rate_hz=200.0, action_repeat=1)
+    pacer = SensorInput("image", "camera", (8, 8, 3))
+    sensors = {"image": pacer}
     reset = lambda self: None
     step = lambda self, image: np.array([0.2, 0.1])
 
