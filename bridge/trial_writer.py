@@ -98,11 +98,11 @@ class TrialWriter:
         """Add the yaw rate [rad/s] of an inertial measurement unit."""
         self._add("imu", t, gyro, stamp)
 
-    def message(self, topic: str, kind: Any, data: bytes) -> None:
-        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file."""
+    def message(self, topic: str, kind: Any, data: bytes, received: int = 0) -> None:
+        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file; times as `McapWriter`."""
         if self._mcap is None:
             self._mcap = McapWriter(self._partial / MCAP)
-        self._mcap.write(topic, kind, data)
+        self._mcap.write(topic, kind, data, received)
 
     def flush(self) -> None:
         """Hand the rows so far to the operating system."""
