@@ -19,9 +19,10 @@ from bridge.bases import BASES
 from bridge.commands import endpoints
 from bridge.controller import Controller
 from bridge.diagnosis import Evidence, FrameLog, causes, input_cause
+from bridge.exits import Exit, OptionError, refusal
 from bridge.image import ImageError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
-from bridge.policy import Policy, PolicyFileError, SensorInput
+from bridge.policy import Policy, SensorInput
 from bridge.safety import Command, SafetyConfig
 from bridge.sense_topics import SenseTopic, reader_of, topics_of
 from bridge.senses import SenseError
@@ -77,10 +78,13 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 def safety_config(policy: Policy, options: argparse.Namespace) -> SafetyConfig:
     """Return the limits in force: the policy's own, narrowed by base and command line, zero always included."""
     low, high = limits(policy.commands.low, policy.commands.high, options)
-    return SafetyConfig(low=low, high=high, slew=(options.slew[0], options.slew[1]),
-                        frame_age=options.frame_age, stamp_age=options.stamp_age,
-                        hold_zeros=BASES[options.base].hold_zeros,
-                        require_arm=options.require_arm, auto_resume=options.resume == "auto")
+    try:
+        return SafetyConfig(low=low, high=high, slew=(options.slew[0], options.slew[1]),
+                            frame_age=options.frame_age, stamp_age=options.stamp_age,
+                            hold_zeros=BASES[options.base].hold_zeros,
+                            require_arm=options.require_arm, auto_resume=options.resume == "auto")
+    except ValueError as error:  # the policy's own limits were checked
+        raise OptionError(str(error)) from None
 
 
 class DriveNode(VehicleNode):
@@ -222,16 +226,16 @@ class DriveNode(VehicleNode):
 
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until SIGTERM or Ctrl-C; return 2 where the policy file or an option is refused."""
+    """Run the node until SIGTERM or Ctrl-C; return an `Exit`: FAULT where the policy file is refused."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
         options = parse_arguments(parameters.as_options(ros_arguments, ros.DRIVE_NAME, "policy") + own)
         policy = Policy.load(options.policy)
         safety = safety_config(policy, options)
         view = view_of(policy.pacer, options.crop and tuple(options.crop), options.calibration)
-    except (PolicyFileError, ValueError) as error:
+    except ValueError as error:
         print(f"bridge.drive: {error}", file=sys.stderr)
-        return 2
+        return refusal(error)
     with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
         controller = Controller(policy, safety, on_blind=options.blind, on_novel=options.novel,
                                 pace_by_stamp=options.pace == "stamp", view=view)
@@ -243,7 +247,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.results:
             supervisor = drive.supervisor
             ros.write_json(options.results, {"counts": dict(supervisor.counts), "reason": supervisor.reason})
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandTopic
+from bridge.exits import Exit
 from bridge.options import Parser, ends_at_ctrl_c, topic_name, whole
 from bridge.vehicle_time import VehicleTime
 
@@ -235,7 +236,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse_arguments(own)
     with ros.node_session(ros.GUARD_NAME, ros_arguments, options.realtime) as node:
         ros.spin(node, GuardNode(node, options).finished)
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

@@ -25,8 +25,9 @@ import numpy as np
 
 from bridge import ros
 from bridge.episodes import EpisodeServer
+from bridge.exits import Exit, OptionError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
-from bridge.policy import pacer_of
+from bridge.policy import PolicyFileError, pacer_of
 from bridge.simulate_node import SimulateNode
 from bridge.simulated import SCAN_HEIGHT, SCAN_RANGE, SCAN_RAYS, Frame, Grid, SimulatedVehicle
 
@@ -260,8 +261,8 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task and "
-                         "vehicle. Correct it or leave it out.") from error
+        raise OptionError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task and "
+                          "vehicle. Correct it or leave it out.") from error
     changes = dict(options.set)
     if options.policy is None:
         given = {"task": options.task or "corridor", "vehicle": options.vehicle, **changes}
@@ -276,16 +277,16 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
             given["senses"] = world.senses
     if options.robot is None:
         if options.wheels:
-            raise ValueError("--wheels names the wheels of a robot file. Give --robot too, or leave it out.")
+            raise OptionError("--wheels names the wheels of a robot file. Give --robot too, or leave it out.")
         return factory(**given)
     from sysid.replay.robot_online import OnlineRobot
     from whill_mjx.env import as_vehicle
 
     if options.simulator != SIMULATOR:
-        raise ValueError(f"--robot {options.robot} is driven by a simulator of its own. Leave --simulator out.")
+        raise OptionError(f"--robot {options.robot} is driven by a simulator of its own. Leave --simulator out.")
     if given.get("senses"):
-        raise ValueError(f"--robot {options.robot} shows its camera alone, and the policy reads "
-                         f"{', '.join(sorted(given['senses']))}. Leave --robot out.")
+        raise OptionError(f"--robot {options.robot} shows its camera alone, and the policy reads "
+                              f"{', '.join(sorted(given['senses']))}. Leave --robot out.")
     robot = OnlineRobot(options.robot, options.wheels or ())
     given["vehicle"] = robot.spec(as_vehicle(given["vehicle"])[0])
     moved: Any = MovedSimulator(robot, **given)
@@ -343,7 +344,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until its episodes are over, SIGTERM or Ctrl-C; return 2 where an option is refused."""
+    """Run the node until its episodes are over, SIGTERM or Ctrl-C; return an `Exit`."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
     compiling: Any = contextlib.nullcontext()
@@ -360,7 +361,7 @@ def main(arguments: list[str] | None = None) -> int:
             vehicle = make_vehicle(options)
         except (ValueError, FileNotFoundError) as error:
             print(f"bridge.simulate: {error}", file=sys.stderr)
-            return 2
+            return Exit.FAULT if isinstance(error, PolicyFileError) else Exit.REFUSED
     with ros.node_session("bridge_simulate", ros_arguments, options.realtime) as node:
         simulate = SimulateNode(node, vehicle, options)
         try:
@@ -368,7 +369,7 @@ def main(arguments: list[str] | None = None) -> int:
                 simulate.calls(), options.bind, options.port, os.environ.get(TOKEN_VARIABLE, ""))
         except (ValueError, OSError, OverflowError) as error:
             print(f"bridge.simulate: --port {options.port}: {error}", file=sys.stderr)
-            return 2
+            return Exit.REFUSED
         if server is not None:
             node.get_logger().info(f"episode control on {options.bind}, port {server.port}")
         ros.spin(node, simulate.finished)
@@ -376,7 +377,7 @@ def main(arguments: list[str] | None = None) -> int:
             server.close()
         if options.results:
             ros.write_json(options.results, simulate.results())
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bridge.exits import OptionError
 from bridge.image import Crop, ImageError, compressed_size, compressed_to_rgb8, to_rgb8
 from bridge.parameters import load_yaml
 from bridge.policy import SensorInput
@@ -183,14 +184,15 @@ def view_of(pacer: SensorInput, crop: Crop | None = None, calibration: Path | No
     """
     if pacer.kind != "camera":
         if crop is not None or calibration is not None:
-            raise ValueError(f"--crop and --calibration are of a camera, and the policy reads none (its {pacer.kind} "
-                             "paces it). Leave them out.")
+            raise OptionError(f"--crop and --calibration are of a camera, and the policy reads none (its {pacer.kind} "
+                              "paces it). Leave them out.")
         return None
     size = pacer.size
     if calibration is None:
         return View(size, crop)
     if crop is not None:
-        raise ValueError("--crop and --calibration: the calibrated view needs the whole image. Leave one of them out.")
+        raise OptionError("--crop and --calibration: the calibrated view needs the whole image. Leave one of them "
+                          "out.")
     if "fov_y" not in pacer.camera:
         raise ValueError(f"--calibration {calibration}: the policy file does not state its camera's field of view "
                          "(camera.fov_y). Export the policy again, or give --crop.")

@@ -8,6 +8,7 @@ import tomllib
 
 import pytest
 
+from bridge.exits import Exit
 from bridge.record import believed, finish, main, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 from bridge.split_writer import SplitWriter
@@ -203,7 +204,7 @@ def test_recording_of_a_killed_recorder_is_recovered_without_its_torn_row(tmp_pa
     assert [row["x"] for row in rows] == [0.0, 0.05, 0.1] and rows[2]["stamp"] == 100.2
     assert "recovered" in capsys.readouterr().err
     gone.mkdir()
-    assert main(["--recover", str(tmp_path)]) == 2 and "exists already" in capsys.readouterr().err
+    assert main(["--recover", str(tmp_path)]) == Exit.FAULT and "exists already" in capsys.readouterr().err
 
 
 def test_yaw_rate_of_an_imu_is_kept_with_its_stamps(tmp_path):
