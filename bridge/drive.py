@@ -231,6 +231,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         options = parse_arguments(parameters.as_options(ros_arguments, ros.DRIVE_NAME, "policy") + own)
         policy = Policy.load(options.policy)
+        if options.joystick_lock and not options.require_arm:
+            raise OptionError("--joystick-lock takes the joystick from the rider, so an operator must arm. Give "
+                              "--require-arm too.")
         safety = safety_config(policy, options)
         view = view_of(policy.pacer, options.crop and tuple(options.crop), options.calibration)
     except ValueError as error:

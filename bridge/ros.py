@@ -31,6 +31,7 @@ PAUSE_TOPIC = "simulate/pause"
 COLLISION_TOPIC = "collision_sensor"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
 CHAIR_STATE_TOPIC = "whill/states/model_cr2"
+JOYSTICK_LOCK_SERVICE = "whill/set_joystick_lock_srv"
 E_STOP_TOPIC = "e_stop"
 ENABLE_TOPIC = "enable"
 JOY_TOPIC = "joy"
@@ -314,6 +315,17 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
             signal.signal(number, handler)
 
 
+def spin_some(node: Any, seconds: float) -> None:
+    """Serve the callbacks of a node that spins no more, for so long [s] at most."""
+    executor = make_executor()
+    executor.add_node(node)
+    try:
+        executor.spin_once(timeout_sec=seconds)
+    finally:
+        executor.remove_node(node)
+        executor.shutdown()
+
+
 def steady_timer(node: Any, period: float, callback: Callable[[], object]) -> Any:
     """A timer on the steady clock: a node timer would stop with /clock where the simulation's time is used."""
     from rclpy.clock import Clock, ClockType
@@ -333,6 +345,29 @@ def chair_state_type() -> Any:
         raise SystemExit(f"{error}. The chair's state is a whill_msgs/ModelCr2State. Build the maker's "
                          "ros2_whill_interfaces in your workspace and source it.") from error
     return ModelCr2State
+
+
+def joystick_locker(node: Any) -> Callable[[bool, Callable[[bool], None]], None]:
+    """Return a function that asks the WHILL driver to lock the chair's joystick, or to unlock it.
+
+    It calls back with whether the driver has done so, and does nothing while there is no driver.
+
+    Raises:
+        SystemExit: the maker's message package is not installed.
+    """
+    try:
+        from whill_msgs.srv import SetJoystickLock
+    except ImportError as error:
+        raise SystemExit(f"{error}. The joystick's lock is a whill_msgs/SetJoystickLock. Build the maker's "
+                         "ros2_whill_interfaces in your workspace and source it.") from error
+    client = node.create_client(SetJoystickLock, JOYSTICK_LOCK_SERVICE)
+
+    def ask(locked: bool, answered: Callable[[bool], None]) -> None:
+        if client.service_is_ready():
+            future = client.call_async(SetJoystickLock.Request(d0=int(locked)))
+            future.add_done_callback(lambda done: answered(done.exception() is None and done.result().result == 1))
+
+    return ask
 
 
 def stamp_seconds(stamp: Any) -> float:
