@@ -78,13 +78,13 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 def safety_config(policy: Policy, options: argparse.Namespace) -> SafetyConfig:
     """Return the limits in force: the policy's own, narrowed by base and command line, zero always included."""
     low, high = limits(policy.commands.low, policy.commands.high, options)
-    try:
-        return SafetyConfig(low=low, high=high, slew=(options.slew[0], options.slew[1]),
-                            frame_age=options.frame_age, stamp_age=options.stamp_age,
-                            hold_zeros=BASES[options.base].hold_zeros,
-                            require_arm=options.require_arm, auto_resume=options.resume == "auto")
-    except ValueError as error:  # the policy's own limits were checked
-        raise OptionError(str(error)) from None
+    if not all(options.slew):
+        raise OptionError(f"--slew {options.slew[0]:g} {options.slew[1]:g}: both must be above 0, or the vehicle never "
+                          "moves. Correct them or leave them out.")
+    return SafetyConfig(low=low, high=high, slew=(options.slew[0], options.slew[1]),
+                        frame_age=options.frame_age, stamp_age=options.stamp_age,
+                        hold_zeros=BASES[options.base].hold_zeros,
+                        require_arm=options.require_arm, auto_resume=options.resume == "auto")
 
 
 class DriveNode(VehicleNode):

@@ -269,10 +269,9 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     else:
         from whill_mjx.evaluation.policy_world import read_world
 
-        world = read_world(options.policy)
-        same = options.task in (None, world.task)
-        given = {"task": options.task or world.task, "vehicle": options.vehicle or world.vehicle,
-                 "size": (world.height, world.width), **(world.fields if same else {}), **changes}
+        world = read_world(options.policy, options.task)
+        given = {"task": world.task, "vehicle": options.vehicle or world.vehicle,
+                 "size": (world.height, world.width), **world.fields, **changes}
         if world.senses:
             given["senses"] = world.senses
     if options.robot is None:
@@ -306,8 +305,7 @@ def field(text: str) -> tuple[str, Any]:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = Parser(prog="python -m bridge.simulate",
-                                     description="Serve the simulator on the vehicle's topics.")
+    parser = Parser(prog="bridge.simulate", description="Serve the simulator on the vehicle's topics.")
     parser.add_argument("policy", nargs="?", type=Path, help="folder of a policy or of its training: task, gates, "
                         "vehicle and camera are those that it was trained with")
     parser.add_argument("--task", help="default: that of the policy, or corridor")

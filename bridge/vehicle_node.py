@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from bridge import inputs, ros
 from bridge.bases import BASES
 from bridge.commands import Commanders, CommandTopic, Ear, Endpoint
+from bridge.exits import OptionError
 from bridge.guard import BEAT_PERIOD, GuardLink
 from bridge.joystick_lock import JoystickLock
 from bridge.options import in_range, topic_name, whole
@@ -290,11 +291,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def limits(low: tuple[float, float], high: tuple[float, float], options: argparse.Namespace
            ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the smallest and largest command: these, narrowed by base and command line, zero always included."""
+    """Return the smallest and largest command: these, narrowed by base and command line, zero always included.
+
+    Raises:
+        OptionError: limits of the command line that leave out zero.
+    """
     base = BASES[options.base]
     lows = [max(min(a, 0.0), b) for a, b in zip(low, base.low, strict=True)]
     highs = [min(max(a, 0.0), b) for a, b in zip(high, base.high, strict=True)]
-    for i, narrower in enumerate((options.v_limits, options.omega_limits)):
+    for i, (name, narrower) in enumerate((("--v-limits", options.v_limits), ("--omega-limits", options.omega_limits))):
+        if narrower and not narrower[0] <= 0 <= narrower[1]:
+            raise OptionError(f"{name} {narrower[0]:g} {narrower[1]:g}: the first must be at most 0 and the second at "
+                              "least, because stopping is a zero command. Correct them.")
         if narrower:
             lows[i], highs[i] = max(lows[i], narrower[0]), min(highs[i], narrower[1])
     return (lows[0], lows[1]), (highs[0], highs[1])

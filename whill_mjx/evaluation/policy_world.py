@@ -45,8 +45,8 @@ def find_policy(path: str | Path) -> Path:
     return inside if (inside / "policy.json").is_file() and not (path / "policy.json").is_file() else path
 
 
-def read_world(path: str | Path) -> PolicyWorld:
-    """The world of a policy, or of the policy of a training.
+def read_world(path: str | Path, task: str | None = None) -> PolicyWorld:
+    """The world of a policy, or of the policy of a training; its vehicle and sensors in that of another task, if given.
 
     Raises:
         PolicyFileError: there is no policy, or it is damaged.
@@ -59,20 +59,21 @@ def read_world(path: str | Path) -> PolicyWorld:
     if commands is None or pacer is None:
         raise OptionError(f"{folder}: the policy drives no vehicle, or its file does not say by which sensors. Export "
                           "it again (whill_mjx.train writes them).")
+    name = task or contract.task
     try:
-        find_task(contract.task)
+        find_task(name)
     except ValueError as error:
-        raise OptionError(f"{folder}: {error} Give --task.") from error
+        raise OptionError(f"--task {task}: {error}" if task else f"{folder}: {error} Give --task.") from error
     limits = {"v_min": commands.low[0], "v_max": commands.high[0], "omega_max": commands.high[1],
               "action_repeat": commands.action_repeat}  # fmt: skip
     vehicle, unpacked = vehicle_file(folder, checked)
-    fields = {**trained_fields(folder, contract.task), **limits}
+    fields = {**trained_fields(folder, name), **limits} if name == contract.task else {}
     senses: dict[str, tuple[Any, SensorInput]] = {}
     if isinstance(contract, AgentContract):
-        sensors = sensors_of(contract, make_task(contract.task, **fields))
+        sensors = sensors_of(contract, make_task(name, **fields))
         senses = {name: (sensors[name], about) for name, about in contract.sensors.items()}
     height, width = pacer.size if pacer.kind == "camera" else (64, 64)
-    return PolicyWorld(contract.task, fields, vehicle, height, width, senses, unpacked)
+    return PolicyWorld(name, fields, vehicle, height, width, senses, unpacked)
 
 
 def trained_fields(policy: Path, task: str) -> dict[str, Any]:
