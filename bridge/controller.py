@@ -8,7 +8,7 @@ when frames do not.
 import time
 import zlib
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -70,18 +70,18 @@ class Controller:
         self._ticks = 0
         self._uniform: dict[str, int] = {}  # uniform images in a row of each camera
 
-    def on_image(self, now: float, stamp: float, stamp_age: float, height: int, width: int, encoding: str, step: int,
-                 data: object) -> Command | None:
+    def on_image(self, now: float, stamp: float, stamp_age: float, message: Any) -> Command | None:
         """Take one camera message; return the command to publish, None where there is none to send now.
 
         Args:
             now: steady time of receipt [s].
             stamp: stamp of the message [s].
             stamp_age: time of receipt minus stamp, on the clock that made the stamp [s].
-            height, width, encoding, step, data: the fields of sensor_msgs/Image.
+            message: has the fields of sensor_msgs/Image: height, width, encoding, step, data.
         """
-        self.image_bytes = height * step
-        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.raw(height, width, encoding, step, data))
+        self.image_bytes = message.height * message.step
+        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.raw(
+            message.height, message.width, message.encoding, message.step, message.data))
 
     def on_compressed(self, now: float, stamp: float, stamp_age: float, data: object) -> Command | None:
         """Take one sensor_msgs/CompressedImage, JPEG or PNG; times and result as of `on_image`."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -65,8 +66,9 @@ class World:
         self.now += dt
         self.count += 1
         data = bytes([self.count % 200 + 20]) * 192
-        fields = dict(stamp=self.now, stamp_age=0.0, height=8, width=8, encoding="rgb8", step=24, data=data)
-        return self.controller.on_image(self.now, **{**fields, **changes})
+        fields = dict(stamp=self.now, stamp_age=0.0, height=8, width=8, encoding="rgb8", step=24, data=data) | changes
+        stamp, age = fields.pop("stamp"), fields.pop("stamp_age")
+        return self.controller.on_image(self.now, stamp, age, SimpleNamespace(**fields))
 
     def tick(self, dt):
         self.now += dt
