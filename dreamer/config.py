@@ -23,7 +23,7 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("noise_steps", "horizon", "imag_last", "train_ratio"), (0, 1e6)),
     **dict.fromkeys(("mean_pull", "policy_outscale", "entropy_scale", "slow_reg", "replay_value_scale", "barlow_scale",
                      "barlow_redundancy", "dyn_scale", "rep_scale", "recon_scale", "vector_scale", "reward_scale",
-                     "continue_scale", "free_nats", "behavior_lr", "agc", "agc_min_norm", "eps"), (0, 1e6)),
+                     "continue_scale", "free_nats", "behavior_lr", "agc", "agc_min_norm", "eps"), (0, 1e12)),
     **dict.fromkeys(("learning_starts", "pretrain_steps", "pretrain_updates", "warmup", "lr_decay"), (0, 1e12)),
     "replay_capacity": (1, 1e12),
     "mirror": (0, 1000),
