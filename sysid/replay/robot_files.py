@@ -28,6 +28,10 @@ BOX = 0.1  # m, of a mesh whose body says nothing of its size
 XACRO = "pip install xacro"
 
 
+mujoco.set_mju_user_warning(lambda text: None)
+"""What is wrong in a model is raised; MuJoCo's own handler writes MUJOCO_LOG.TXT where the command was called."""
+
+
 def read_robot(
     path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None,
 ) -> tuple[Any, list[str], dict[str, float] | None]:  # fmt: skip

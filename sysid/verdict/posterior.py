@@ -7,15 +7,14 @@ a saved file can be judged again, with other priors too (`python -m sysid.verdic
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from whill_mjx.io.fields import shown
+from whill_mjx.io.fields import record, shown
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.formats import FORMATS, stamp, upgraded
 from whill_mjx.io.reading import read_json
@@ -23,8 +22,6 @@ from whill_mjx.io.reading import read_json
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
 KIND = "sysid-evidence"
 AGAIN = "Give evidence.json of a run of sysid.close_loop."
-WORDS = ("effects", "variants", "classes", "against", "noise")
-"""Entries of a file that hold no numbers."""
 MOST = 2
 """Effects that are named together. A third one is only tried to see whether the first stood in for two."""
 
@@ -286,17 +283,22 @@ def as_json(findings: Findings) -> dict[str, Any]:
     return {**stamp(KIND), **asdict(findings)}
 
 
-def from_json(content: dict[str, Any]) -> Findings:
-    """The findings of a file."""
-    def left(one: dict[str, Any]) -> Left:
-        return Left(**one)
+def from_json(content: dict[str, Any], where: str = "findings") -> Findings:
+    """The findings of a file.
 
-    sets = tuple(
-        TriedSet(tuple(one["effects"]), tuple(one["variants"]), tuple(one["coordinates"]), one["gain"], tuple(one["p"]),
-                 one["p_value"], left(one["left"]), tuple(one["own"]), tuple(one["foretold"]), left(one["bent"]),
-                 tuple(tuple(each) for each in one["classes"])) for one in content["sets"])
-    known = {key: value for key, value in content.items() if key not in ("schema", "kind", "sets", "noise")}
-    return Findings(**known, sets=sets, noise=tuple(content["noise"]))
+    Raises:
+        ValueError: if there is a value of another kind, or a set whose lists are not of one length.
+    """
+    findings = record(where, Findings, {key: value for key, value in content.items() if key not in ("schema", "kind")})
+    for index, one in enumerate(findings.sets):
+        lengths = {len(each) for each in (one.effects, one.variants, one.p, one.own, one.foretold, one.classes)}
+        if len(lengths) != 1 or 0 in lengths or not all(one.classes):
+            raise ValueError(f"{where}: sets[{index}]: effects, variants, p, own, foretold and classes must be of one "
+                             "length, above 0.")
+    for name in ("day", "count", "freedom"):
+        if getattr(findings, name) <= 0:
+            raise ValueError(f"{where}: {name} = {shown(getattr(findings, name))} must be above 0.")
+    return findings
 
 
 def read(path: Path) -> Findings:
@@ -309,29 +311,7 @@ def read(path: Path) -> Findings:
     if content.get("kind") != KIND or content.get("schema") != FORMATS[KIND].schema:
         raise ValueError(f"{path}: kind {shown(content.get('kind'))}, schema {shown(content.get('schema'))}; this "
                          f"program reads {KIND!r}, schema {FORMATS[KIND].schema}. {AGAIN}")
-    try:
-        findings = from_json(content)
-    except (TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path}: no evidence of a verdict ({error}). {AGAIN}") from None
-    for name, value in _numbers(asdict(findings)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ValueError(f"{path}: {name} = {shown(value)} is not a finite number. {AGAIN}")
-        if name in ("day", "count", "freedom") and value <= 0:
-            raise ValueError(f"{path}: {name} = {shown(value)} must be above 0. {AGAIN}")
-    return findings
-
-
-def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Name and value of all that must be a number: what is neither a word, None, nor a list or table of such."""
-    if isinstance(content, dict):
-        for key, value in content.items():
-            if key not in WORDS:
-                yield from _numbers(value, key)
-    elif isinstance(content, list | tuple):
-        for value in content:
-            yield from _numbers(value, name)
-    elif content is not None or name != "p_pairs":
-        yield name, content
+    return from_json(content, str(path))
 
 
 def write(path: Path, findings: Findings) -> None:

@@ -195,5 +195,5 @@ def test_another_setting_of_the_baseline_is_refused_on_resuming(tmp_path):
 @pytest.mark.quick
 @pytest.mark.parametrize("wrong", [{"lr": float("nan")}, {"lr": 0.0}, {"discount": 1.5}, {"entropy_scale": -1.0}])
 def test_settings_that_cannot_be_meant_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"PpoConfig.{next(iter(wrong))} = .* must"):
+    with pytest.raises(ValueError, match=f"PpoConfig: {next(iter(wrong))} is .*; it must"):
         PpoConfig(**wrong)
