@@ -11,23 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.logs.clocks import NONE, RESPONSE, VARIED, WHOLE, another_clock, running_fast
 from sysid.logs.pose_jumps import constant_columns, jumps
 from sysid.logs.records import Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
-RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
 MOVING = 0.05  # m/s or rad/s of a pose that moves
-NONE = 0.02  # m/s, below which a speed is none
-VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
 APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
-WHOLE = 0.8  # share of the motion that a direction must explain
 LITTLE = 0.75  # the same, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
 SURE = 4.0  # standard errors that such an angle must have
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
-REACH, LAG_DT = 10.0, 0.1  # s of a clock that is looked for, and its steps
-LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
-UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
 PLAINER = 0.1  # share of the motion that another explanation must explain more of
@@ -66,8 +60,13 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
     Args:
         reach: how far from the axle's centre a tracked point may be [m]. That of the odometry is the centre.
     """
-    return {name: _of_stream(name, trials, reach if name == "ground_truth" else 0.0)
-            for name in ("odometry", "ground_truth")}
+    found: dict[str, list[str]] = {}
+    for name in ("odometry", "ground_truth"):
+        found[name] = _of_stream(name, trials, reach if name == "ground_truth" else 0.0)
+        alone = name == "odometry" or bool(found["odometry"]) or any(trial.odometry is None for trial in trials)
+        if fast := running_fast(name, trials, "commands" if alone else "odometry"):
+            found[name] = [fast]  # whatever else it looked like
+    return found
 
 
 def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
@@ -102,20 +101,6 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
                 f"the vehicle's. Correct them: {remedy}."]
     return []
 
-
-def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds beside it") -> str:
-    """A sentence on a stream of which most trials come later or earlier than the speeds beside it; else empty.
-
-    Args:
-        beside: "commands" compares with these, though there is an odometry.
-    """
-    lates = [late for trial in trials if (late := lateness(trial, name, beside == "commands")) is not None]
-    if len(lates) <= len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
-        return ""
-    late = float(np.median(lates))
-    return (f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the {beside}: "
-            f"another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s {'from' if late > 0 else 'to'} its "
-            "t.")
 
 
 def motion_of(trial: Trial, name: str) -> Motion | None:
@@ -189,50 +174,6 @@ def _explained(signal: np.ndarray, design: np.ndarray) -> float:
     return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
 
 
-def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
-    """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
-    explains what nothing else does; None otherwise.
-
-    Rates of turning and of motion are compared: no frame changes them.
-
-    Args:
-        beside: compare with the commands, though there are measured speeds.
-    """
-    source, odometry = getattr(trial, name), trial.odometry
-    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
-        return None
-    begin, end = min(source.t[0], trial.command.t[0]), max(source.t[-1], trial.command.t[-1])
-    t = np.arange(begin, end, LAG_DT)
-    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
-    inside = (t > source.t[0] + half) & (t < source.t[-1] - half)
-    x, y, yaw = ((np.interp(t + half, source.t, one) - np.interp(t - half, source.t, one)) / (2 * half) * inside
-                 for one in (source.x, source.y, source.yaw))
-    held = command_in_force(trial.command, t - RESPONSE)
-    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
-    commanded = beside or odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
-    if odometry is not None and not commanded:
-        v, omega = (np.interp(t, odometry.t, one, 0.0, 0.0) for one in (odometry.v, odometry.omega))
-    pairs = [(ours, theirs) for ours, theirs in ((yaw, omega), (np.hypot(x, y), np.abs(v)))
-             if min(ours.std(), theirs.std()) > VARIED]
-    if not pairs:
-        return None
-    most = min(round(REACH / LAG_DT), len(t) - 1)
-    # A skid drive turns late and little, a circle has one speed: the pair that fits best shows the clock.
-    alike = max((np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)]) for ours, theirs in pairs),
-                key=np.max)
-    now, k = float(alike[most]), int(np.argmax(alike))
-    bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
-    late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
-    near = round(LATE[commanded] / LAG_DT)
-    against = -float(alike[most - near : most + near + 1].min())  # where the sign is reversed
-    clear = alike[k] > WHOLE and 1 - alike[k] < UNLIKE * (1 - max(now, against))
-    return late if clear and abs(late) > LATE[commanded] else None
-
-
-def _overlap(ours: np.ndarray, theirs: np.ndarray, lag: int) -> float:
-    """Likeness of rates (T,) with others (T,) that come so many rows earlier; outside of them nothing moves."""
-    one, other = ours[max(lag, 0) : len(ours) + min(lag, 0)], theirs[max(-lag, 0) : len(theirs) - max(lag, 0)]
-    return float(one @ other) / max(float(np.sqrt((ours @ ours) * (theirs @ theirs))), 1e-9)
 
 
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:

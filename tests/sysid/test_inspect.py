@@ -350,6 +350,15 @@ def test_commands_of_another_clock_and_cut_off_ones_are_named_and_no_sign_or_uni
     assert re.search("the commands end .* s before the odometry", found)
 
 
+@pytest.mark.parametrize(("stream", "rate"), [("ground_truth", 0.05), ("odometry", -0.04)])
+def test_a_clock_that_runs_fast_or_slow_is_named_with_its_stream_and_rate(stream, rate):
+    good = trial_of(lively())
+    source = getattr(good, stream)
+    (found,) = sanity(log_of(replace(good, **{stream: replace(source, t=source.t * (1 + rate))})))
+    assert found.startswith(f"{stream}: its clock runs") and ("faster" if rate > 0 else "slower") in found
+    assert float(re.search(r"runs ([\d.]+)%", found)[1]) == pytest.approx(100 * abs(rate), abs=0.5)
+
+
 def test_a_base_that_drives_on_while_commands_pause_is_fine():
     assert sanity(log_of(paused(np.inf))) == []
 
