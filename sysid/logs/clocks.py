@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import correlate
 
 from sysid.logs.records import Trial, command_in_force
 from sysid.logs.streams import SMOOTHING, speeds
@@ -19,6 +20,9 @@ WHOLE = 0.8  # likeness that two streams of one motion have
 REACH, LAG_DT = 10.0, 0.1  # s of a clock that is looked for, and its steps
 LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
 UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
+LEFT = {"odometry": 0.5, "commands": UNLIKE}
+"""The same with a clock that runs fast, beside what is measured and beside commands, which a vehicle follows late."""
+APART = 0.3  # s by which clocks must come apart in a drive to be told from a delay
 FASTER, RATE_STEP = 0.15, 0.005  # by which a clock may run fast or slow, and steps of the search
 
 
@@ -64,10 +68,10 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
              if min(ours.std(), theirs.std()) > VARIED]
     if not pairs:
         return None
-    most = min(round(REACH / LAG_DT), len(t) - 1)
+    most = len(t) - 1
     # A skid drive turns late and little, a circle has one speed: the pair that fits best shows the clock.
-    alike = max((np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)]) for ours, theirs in pairs),
-                key=np.max)
+    alike = max((correlate(ours, theirs) / max(float(np.linalg.norm(ours) * np.linalg.norm(theirs)), 1e-9)
+                 for ours, theirs in pairs), key=np.max)  # outside of its rows nothing moves
     now, k = float(alike[most]), int(np.argmax(alike))
     bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
     late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
@@ -76,11 +80,6 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
     clear = alike[k] > WHOLE and 1 - alike[k] < UNLIKE * (1 - max(now, against))
     return late if clear and abs(late) > LATE[commanded] else None
 
-
-def _overlap(ours: np.ndarray, theirs: np.ndarray, lag: int) -> float:
-    """Likeness of rates (T,) with others (T,) that come so many rows earlier; outside of them nothing moves."""
-    one, other = ours[max(lag, 0) : len(ours) + min(lag, 0)], theirs[max(-lag, 0) : len(theirs) - max(lag, 0)]
-    return float(one @ other) / max(float(np.sqrt((ours @ ours) * (theirs @ theirs))), 1e-9)
 
 
 def running_fast(name: str, trials: Sequence[Trial], beside: str = "commands") -> str:
@@ -96,13 +95,16 @@ def running_fast(name: str, trials: Sequence[Trial], beside: str = "commands") -
         return ""
     unlike = np.mean(curves, axis=0)
     k, now = int(np.argmin(unlike)), float(unlike[len(rates) // 2])
-    if not 0 < k < len(rates) - 1 or 1 - unlike[k] < WHOLE or unlike[k] > UNLIKE * now:
+    if not 0 < k < len(rates) - 1 or 1 - unlike[k] < WHOLE or unlike[k] > LEFT[beside] * now:
         return ""
     bend = unlike[k - 1] - 2 * unlike[k] + unlike[k + 1]
     rate = rates[k] + (0.5 * float((unlike[k - 1] - unlike[k + 1]) / bend) if bend > 0 else 0.0) * RATE_STEP
-    return (f"{name}: its clock runs {abs(rate):.1%} {'faster' if rate > 0 else 'slower'} than that of the {beside}: "
-            f"the two come apart by {abs(rate) * 60:.1f} s in a minute. Multiply its t by {1 / (1 + rate):.3f}, or "
-            f"that of the {beside} by {1 + rate:.3f}, whichever clock is wrong.")
+    if abs(rate) * max(trial.duration for trial in trials) < APART:
+        return ""
+    how = f"about {abs(rate):.0%} {'faster' if rate > 0 else 'slower'}"
+    return (f"{name}: its clock runs {how} than that of the {beside}: the two come apart by {abs(rate) * 60:.1f} s in "
+            f"a minute. Multiply its t by {1 / (1 + rate):.2f}, or that of the {beside} by {1 + rate:.2f}, whichever "
+            "clock is wrong.")
 
 
 def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.ndarray | None:
@@ -121,7 +123,7 @@ def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.n
             shifted = np.stack([np.interp(t - lag, theirs[0], other, 0.0, 0.0) for lag in lags])
             sizes = [np.linalg.norm(each, axis=1, keepdims=True) + 1e-9 for each in (stretched, shifted)]
             found.append(1 - ((stretched / sizes[0]) @ (shifted / sizes[1]).T).max(axis=1))
-    return min(found, key=np.min) if found else None
+    return np.mean(found, axis=0) if found else None
 
 
 def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

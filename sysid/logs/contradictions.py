@@ -7,12 +7,12 @@ the axle. A regression of both on v and omega shows the angle between the pose's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sysid.logs.clocks import NONE, RESPONSE, VARIED, WHOLE, another_clock, running_fast
-from sysid.logs.pose_jumps import constant_columns, jumps
+from sysid.logs.pose_jumps import constant_columns, frozen, jumps
 from sysid.logs.records import Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
@@ -33,6 +33,7 @@ class Motion:
 
     t: np.ndarray  # (G,) s
     steps: np.ndarray  # (G, 2) m/s, in the fixed frame
+    place: np.ndarray  # (G, 2) m
     yaw: np.ndarray  # (G,)
     turn: np.ndarray  # (G,) rad/s
     v: np.ndarray  # (G,) m/s that it should have
@@ -66,12 +67,14 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
         alone = name == "odometry" or bool(found["odometry"]) or any(trial.odometry is None for trial in trials)
         if fast := running_fast(name, trials, "commands" if alone else "odometry"):
             found[name] = [fast]  # whatever else it looked like
+    if not any(found.values()) and (far := _far_point(trials, reach)):
+        found["ground_truth"] = [far]
     return found
 
 
 def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
     empty = _empty_speeds(trials) if name == "odometry" else []
-    if found := [*jumps(name, trials), *empty, *constant_columns(name, trials)]:
+    if found := constant_columns(name, trials) or frozen(name, trials) or [*jumps(name, trials), *empty]:
         return found
     if said := another_clock(name, trials):
         return [said]
@@ -79,11 +82,17 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
     if not motions:
         return []
     plain = _pooled([direction(one, reach) for one in motions])
+    against = float(np.median([_likeness(one.turn, one.omega) for one in motions]))
+    if against < -WHOLE and _pooled([direction(_inverted(one), reach) for one in motions]).explained > max(
+            WHOLE, plain.explained):
+        return [f"{name}: its pose is that of the fixed frame as the vehicle sees it: parent and child are exchanged. "
+                "Invert the transform: (x, y) = -R(-yaw) (x, y), then yaw = -yaw."]
     if plain.explained < LITTLE:
         mirrored = _pooled([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
-            return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged). "
-                    "Counter-clockwise is positive yaw; negate y, or exchange the axes."]
+            return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged), "
+                    "or yaw is a compass heading. Counter-clockwise is positive yaw; negate y, exchange the axes, or "
+                    "take 90 deg - heading."]
         if name == "odometry" and _in_fixed_frame(motions):
             return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
                     "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
@@ -91,6 +100,9 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
             return [f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of how "
                     "the pose moves. Check that both are of one vehicle, frame and clock."]
         return []
+    if name == "odometry" and against < -WHOLE and _obeys(trials):
+        return ["odometry: its yaw turns against its own omega, which follows the commands: yaw has the wrong sign. "
+                "Counter-clockwise is positive; negate yaw, and y if that turns with it."]
     if plain.explained > WHOLE and ANGLE < abs(plain.angle) < BACKWARDS and abs(plain.angle) > SURE * plain.error:
         degrees = np.rad2deg(plain.angle)
         side = "left" if degrees > 0 else "right"
@@ -126,7 +138,8 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
                     for one in (odometry.v, odometry.omega))
     if v.std() < VARIED:
         return None
-    return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega)
+    place = np.stack([at(t, source.x), at(t, source.y)], axis=-1)
+    return Motion(t, steps, place, at(t, source.yaw), turn[:, 0], v, omega)
 
 
 def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
@@ -155,6 +168,47 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
     across, ahead = (float(np.sqrt(np.mean(np.square(one)) / power_alone)) for one in (left.imag, left.real))
     return Direction(float(np.angle(gains[0])), across / max(size, 1e-9), explained, size,
                      float("inf") if too_far else ahead)
+
+
+def _inverted(motion: Motion) -> Motion:
+    """The same motion if the pose is that of the fixed frame in the vehicle's."""
+    cos, sin, half = np.cos(motion.yaw), np.sin(motion.yaw), GRID_DT / 2
+    x, y = motion.place.T
+    back = -np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
+    return replace(motion, steps=np.gradient(back, 2 * half, axis=0), place=back, yaw=-motion.yaw, turn=-motion.turn)
+
+
+def _obeys(trials: Sequence[Trial]) -> bool:
+    """Whether the odometry's yaw rate has the sign of the commanded one."""
+    found = [_likeness(one.odometry.omega, one.command.omega[np.maximum(
+        command_in_force(one.command, one.odometry.t - RESPONSE), 0)]) for one in trials if one.odometry is not None]
+    return bool(np.median(found) > 0)
+
+
+def _likeness(one: np.ndarray, other: np.ndarray) -> float:
+    """Correlation of two signals (T,), 0 where one hardly changes."""
+    return float(np.corrcoef(one, other)[0, 1]) if min(one.std(), other.std()) > MOVING else 0.0
+
+
+def _far_point(trials: Sequence[Trial], reach: float) -> str:
+    """A sentence on a tracked point that surely is farther from the axle's centre than a vehicle reaches, or none."""
+    motions = [motion for trial in trials if (motion := motion_of(trial, "ground_truth")) is not None]
+    if not motions:
+        return ""
+    design = np.concatenate([np.column_stack([one.v, one.omega]) for one in motions])
+    along = np.concatenate([np.exp(-1j * one.yaw) * (one.steps[:, 0] + 1j * one.steps[:, 1]) for one in motions])
+    gains = np.linalg.lstsq(design, along, rcond=None)[0]
+    left = along - design @ gains
+    spread = np.linalg.pinv(design.T @ design) * np.square(np.abs(left)).mean() * APART / GRID_DT
+    explained = 1 - float(np.square(np.abs(left)).sum() / max(np.square(np.abs(along)).sum(), 1e-12))
+    if explained < WHOLE or abs(gains[1]) - SURE * np.sqrt(spread[1, 1]) < reach or abs(gains[0]) < 1e-9:
+        return ""
+    place = -1j * gains[1] * abs(gains[0]) / gains[0]  # a turn moves a point ahead to the left
+    ways = (f"{abs(place.real):.2f} m {'ahead of' if place.real > 0 else 'behind'}",
+            f"{abs(place.imag):.2f} m to the {'left' if place.imag > 0 else 'right'} of")
+    return (f"ground_truth: its point is {ways[0]} and {ways[1]} the drive-axle centre, farther than the vehicle "
+            f"reaches ({reach:.2f} m). If that is so, state it: sysid.convert takes --truth-ahead {place.real:.2f} "
+            f"--truth-left {place.imag:.2f}; else take the body that is on the vehicle.")
 
 
 def _in_fixed_frame(motions: Sequence[Motion]) -> bool:
