@@ -23,7 +23,7 @@ UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
 LEFT = {"odometry": 0.5, "commands": UNLIKE}
 """The same with a clock that runs fast, beside what is measured and beside commands, which a vehicle follows late."""
 APART = 0.3  # s by which clocks must come apart in a drive to be told from a delay
-FASTER, RATE_STEP = 0.15, 0.005  # by which a clock may run fast or slow, and steps of the search
+FASTER, RATE_STEP = 0.2, 0.005  # by which a clock may run fast or slow, and steps of the search
 
 
 def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds beside it") -> str:

@@ -63,20 +63,19 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
     """
     found: dict[str, list[str]] = {}
     for name in ("odometry", "ground_truth"):
-        found[name] = _of_stream(name, trials, reach if name == "ground_truth" else 0.0)
         alone = name == "odometry" or bool(found["odometry"]) or any(trial.odometry is None for trial in trials)
-        if fast := running_fast(name, trials, "commands" if alone else "odometry"):
-            found[name] = [fast]  # whatever else it looked like
+        found[name] = _of_stream(name, trials, reach if name == "ground_truth" else 0.0,
+                                 "commands" if alone else "odometry")
     if not any(found.values()) and (far := _far_point(trials, reach)):
         found["ground_truth"] = [far]
     return found
 
 
-def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
+def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) -> list[str]:
     empty = _empty_speeds(trials) if name == "odometry" else []
     if found := constant_columns(name, trials) or frozen(name, trials) or [*jumps(name, trials), *empty]:
         return found
-    if said := another_clock(name, trials):
+    if said := running_fast(name, trials, beside) or another_clock(name, trials):
         return [said]
     motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if not motions:
