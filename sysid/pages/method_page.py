@@ -71,7 +71,7 @@ def candidates(report: dict[str, Any]) -> str:
                            [[f"{one['effect']} {one['variant']}".strip(), one["gain"], f"{one['explained']:.0%}",
                              one["p_value"]] for one in each],
                            f"Round {number}. Gain: fall of the squared error, in variances of the noise. Explains: "
-                           "share of what can be explained. p: how often chance gains as much where nothing is missing."))
+                           "share of what can be explained. p: how often chance gains as much if nothing is missing."))
     left = ("common", "smooth", "any")
     rows = [[" and ".join(one["effects"]), one["gain"], *(one["left"].get(key, "") for key in left),
              f"{one['share']:.0%}"] for one in report["steps"]]
