@@ -26,7 +26,7 @@ HEADLINES = (  # file, what, value
     ),
     (
         "course",
-        "Success from pixels in new obstacle courses, after 22,000 environment steps, the reference paper's budget",
+        "Success from pixels in new obstacle courses, after the reference paper's 22,000 steps",
         "{success_at_22000|%}",
     ),
     ("course", "Time until PPO succeeds from pixels in 99 % of new obstacle courses, compilation included", "{time_to_99_s} s"),

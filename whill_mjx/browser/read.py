@@ -309,7 +309,7 @@ def _sentence(
             return _progress(state, about, lines)
         if kind == "evaluation" and result:
             name, first = next(iter(result["drivers"].items()))
-            return f"{name} succeeds in {first['success']:.1%} of {first['episodes']} episodes."
+            return f"{name.capitalize()} succeeds in {first['success']:.1%} of {first['episodes']} episodes."
         if kind == "missing effect" and result:
             return f"{result['verdict'].capitalize()}: {result['reason']}."
         if result:

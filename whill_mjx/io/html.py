@@ -41,6 +41,7 @@ td small { color: #6a6a6a; display: block; }
 td.good { color: #176b32; } td.bad { color: #a31621; font-weight: 600; } td.warn { color: #8a5a00; }
 .charts { display: flex; flex-wrap: wrap; gap: .4rem 1rem; } figure { margin: .4rem 0; }
 figcaption { font-size: .84rem; color: #6a6a6a; max-width: 62rem; } img, video { max-width: 100%; }
+video { max-height: 70vh; }
 code { font-size: .84rem; overflow-wrap: anywhere; }
 svg.chart { max-width: 100%; height: auto; background: #fff; } svg text { fill: #333; font-family: inherit; }
 svg .title { font-size: 11.5px; font-weight: 600; } svg .label { font-size: 11px; } svg .tick { font-size: 10px; }
@@ -51,7 +52,7 @@ svg .grid { stroke: #e4e4e4; stroke-width: 1; } svg .band { fill: #1f6fb4; opaci
   h2 { font-size: 1.1rem; margin-top: 1.6rem; } .charts { display: block; } .charts svg { width: 100%; }
   nav a { padding: .25rem 0; } th, td { padding: .25rem .4rem; } figure { margin: .4rem 0; }
   ul { padding-left: 1.2rem; } td:not(.n) { min-width: 4.2rem; } td:first-child:not(.n) { min-width: 7rem; }
-  td:last-child:not(.n) { min-width: 10rem; } video { max-height: 70vh; } }
+  td:last-child:not(.n) { min-width: 10rem; } }
 @media print { @page { margin: 14mm; } body { font-size: 10pt; max-width: none; padding: 0; }
   nav, video { display: none; }
   h2, h3, caption { break-after: avoid; } figure, tr, svg, img { break-inside: avoid; } .scroll { overflow: visible; }
