@@ -81,7 +81,7 @@ class EvaluateOptions:
     near: Annotated[float, NOT_NEGATIVE] = NEAR_M
     """Distance below which there is a near miss [m]."""
     seed: Annotated[int, SEED] = 2_000_003
-    """Of the episodes; training and its own evaluations use others."""
+    """Random seed of the episodes; training and its own evaluations use others."""
     batch: Annotated[int, Range(1, 1_000_000)] = 1000
     """Episodes at a time."""
     runtime: Literal["jax", "onnxruntime"] = "jax"
