@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, check_known, listen, refusing, starts
+from whill_mjx.io.heartbeat import say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 import numpy as np
 

@@ -17,9 +17,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, refusing, run, starts
+from whill_mjx.io.heartbeat import Heartbeat, say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,6 @@ from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import PlannerConfig, first_plan, for_task, plan_action
 from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun, step_with_terms
 from whill_mjx.io.folders import check_place, whole_file, write_whole
-from whill_mjx.io.heartbeat import Heartbeat
 from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
