@@ -327,7 +327,7 @@ CLAIMS = (
         ("what", "plain", "furnished", "never seen"),
         (
             ("arrived", "{foreign_plain|%}", "{foreign_furnished|%}", "{foreign_unseen|%}"),
-            ("of each seed", *(f"{{foreign_{one}|range %}}" for one in ("plain", "furnished", "unseen"))),
+            ("arrived, of each seed", *(f"{{foreign_{one}|range %}}" for one in ("plain", "furnished", "unseen"))),
             ("collided", *(f"{{foreign_{one}_collided|%}}" for one in ("plain", "furnished", "unseen"))),
             ("arrived, with the stop", *(f"{{foreign_with_stop_{one}|%}}" for one in ("plain", "furnished", "unseen"))),
             ("collided, with the stop",
