@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Literal
 
 from whill_mjx.io.command_line import listen, starts
+from whill_mjx.io.heartbeat import say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 from sysid import command_line
 from sysid.logs.coverage import doubts

@@ -75,7 +75,7 @@ class DriveOptions:
     held_out: tuple[str, ...] = ()
     """Manoeuvres that the dataset declares as never to be fitted."""
     seed: Annotated[int, SEED] = 0
-    """Of start poses and noise."""
+    """Random seed of start poses and noise."""
     scenario: Scenario = field(default_factory=Scenario)
     """How hard the manoeuvres are driven."""
 

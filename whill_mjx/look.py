@@ -18,9 +18,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, refusing, run, starts
+from whill_mjx.io.heartbeat import Heartbeat, say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 import jax
 import jax.numpy as jnp
@@ -289,10 +291,12 @@ def main(options: Look) -> None:
         write_video(options.out, frames, options.scale)
         print(f"{options.out}: {len(frames)} frames of {options.scene}")
         return
-    if options.scene == "gallery":
-        sheet = gallery_sheet()
-    else:
-        sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
+    with Heartbeat() as heartbeat:
+        heartbeat.stage(f"drawing {options.scene}: half a minute, most of it compilation")
+        if options.scene == "gallery":
+            sheet = gallery_sheet()
+        else:
+            sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
     write_png(options.out, sheet.repeat(options.scale, 0).repeat(options.scale, 1))
     print(f"{options.out}: {options.scene}")
 

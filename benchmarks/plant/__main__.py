@@ -14,6 +14,7 @@ from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import make_log
 from bridge.options import Parser, in_range, whole
 from whill_mjx.io.command_line import OptionError, guarded
+from whill_mjx.io.heartbeat import Heartbeat
 
 
 def main(arguments: list[str] | None = None) -> Path:
@@ -41,10 +42,12 @@ def main(arguments: list[str] | None = None) -> Path:
         raise OptionError(
             f"--effects {given.effects!r}: not JSON of sizes by name. Write '{{\"slope\": 0.02}}'."
         ) from None
-    return make_log(
-        given.out, effects, given.seed, given.noise, not given.nominal, not given.no_ground_truth, given.manoeuvres,
-        given.replicates, given.answers, given.processes, given.vehicle,
-    )  # fmt: skip
+    with Heartbeat() as heartbeat:
+        heartbeat.stage("driving the manoeuvres on the contact plant")
+        return make_log(
+            given.out, effects, given.seed, given.noise, not given.nominal, not given.no_ground_truth, given.manoeuvres,
+            given.replicates, given.answers, given.processes, given.vehicle,
+        )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -134,7 +134,7 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
     start = None if vehicle is None or not references else vehicle.params
     kept = vehicle if start is None else None
     progress, close = command_line.progress_bar(
-        expected_steps(config, len(days_of(references)), kept is not None), "close the loop", "step")
+        expected_steps(config, len(days_of(references)), kept is not None), "close the loop")
     progress(0, "reference vehicle")
     try:
         return find_missing(log, references, config, kept, progress, start=start)
