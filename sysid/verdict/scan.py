@@ -105,22 +105,30 @@ def run(
     rng = np.random.default_rng(seed)
     solver = Solver(evidence)
     gain, worth, q = best(solver, hypotheses, wander)
-    moments = null_moments(evidence, spread, draws, rng)
-    share = wander.draw_shares(draws, rng)
+    days = null_days(evidence, spread, wander, draws, rng)
     null = np.zeros((draws, len(hypotheses)))
     for number, (columns, covariance) in enumerate(zip(evidence.columns, wander.covariance, strict=True)):
-        away = wander.away(number, share)
-        found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance, moments, away)
+        away = wander.away(number, days.share)
+        found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance, days.moments, away)
         null[:, columns.hypothesis] = np.maximum(null[:, columns.hypothesis], found.worth)
     p = np.array([tail(null[:, h], worth[h]) for h in range(len(hypotheses))])
     each = np.stack([tail(null[:, h], null[:, h]) for h in range(len(hypotheses))], axis=-1)
     return Scan(gain, worth, q, null, p, each.min(1))
 
 
-def null_moments(
-    evidence: Evidence, spread: np.ndarray, draws: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Moments (N, P + S) of simulated drives in which nothing is missing."""
+@dataclass(frozen=True)
+class NullDays:
+    """Simulated days on which nothing is missing."""
+
+    moments: np.ndarray  # (N, P + S)
+    share: np.ndarray  # (N, D) of the reference days' apparent effects in each
+
+
+def null_days(
+    evidence: Evidence, spread: np.ndarray, wander: Wander, draws: int, rng: np.random.Generator
+) -> NullDays:
+    """Draw days with the noise and commands of some drives; `spread` (P, P) is the day-to-day covariance of the base
+    parameters."""
     size = evidence.base_size
     factor = np.linalg.cholesky(spread + 1e-14 * np.eye(size))
     products = evidence.products.sum(0)[:, :size]
@@ -129,7 +137,7 @@ def null_moments(
         moments[n] = products @ drawn_away(factor, rng)
         for group in evidence.groups:
             moments[n] += drawn_noise([evidence.pool_moments[trial] for trial in group], evidence.shared, rng)
-    return moments
+    return NullDays(moments, wander.draw_shares(draws, rng))
 
 
 def drawn_noise(pools: Sequence[np.ndarray], shared: float, rng: np.random.Generator) -> np.ndarray:

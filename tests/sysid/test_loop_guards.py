@@ -86,7 +86,8 @@ def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600, prediction=None):
     parts = np.stack([effect * q[1] * ~half, effect * q[1] * half], axis=-1)
     refitter = SimpleNamespace(precision=np.eye(1), reference=SimpleNamespace(u=np.zeros(1)))
     size, covariance = sizes_in_parts(fit, slice(0, 1), parts, refitter, [[2 * k, 2 * k + 1] for k in range(3)])
-    return size, covariance, falsification._same("slope", prediction or SIGN, size, covariance, 8, 0.003)
+    law = falsification.Law("slope", prediction or SIGN, 0.003)
+    return size, covariance, falsification._same(law, size, covariance, 8)
 
 
 def test_an_effect_with_one_size_stands_its_split():
@@ -128,8 +129,8 @@ def test_what_is_left_where_an_effect_does_nothing_may_be_another_ones_form(othe
     quiet = np.zeros((6, 600, 1), bool)
     quiet[:, :300] = True
     p_excess = lambda excess: 0.5 if excess < 0.2 else 1e-6  # noqa: E731
-    settled = GONE_WHEN_SETTLED
-    tested = falsification._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
+    law = falsification.Law("command_delay", GONE_WHEN_SETTLED, 0.003)
+    tested = falsification._absent(law, fit, 0, np.eye(1), quiet, p_excess)
     assert tested.outcome == outcome
 
 
