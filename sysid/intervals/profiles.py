@@ -100,7 +100,7 @@ def profile(
         slope = known.covariance[:, index] / max(known.covariance[index, index], 1e-16)
         starts = np.clip(space.moved(np.tile(u, (len(grid), 1)), (grid - u[index])[:, None] * slope), 0.0, 1.0)
         starts[:, index] = grid
-        result = least_squares.fit(objective, space, starts=starts, iterations=iterations, robust=robust,
+        result = least_squares.fit(objective, starts=starts, stop=least_squares.Stopping(iterations), robust=robust,
                                    frozen=(name,), progress=progress)
         order = np.argsort(result.starts[:, index])
         cost = np.minimum(result.start_costs[order], np.where(np.isclose(grid, u[index], atol=1e-9), best, np.inf))

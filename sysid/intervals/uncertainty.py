@@ -116,7 +116,7 @@ def _ahead(objective: Told, found: Evidence, robust: bool) -> np.ndarray:
                 continue
             start = space.moved(u[None], step * inverse[None, :, index] / inverse[index, index])
             start[:, index] = u[index] + step
-            there = least_squares.fit(objective, space, starts=np.clip(start, 0.0, 1.0), iterations=FOLLOW,
+            there = least_squares.fit(objective, starts=np.clip(start, 0.0, 1.0), stop=least_squares.Stopping(FOLLOW),
                                       robust=robust, frozen=(space.names[index],)).u
             known = errors_of(_evidence_at(objective, there, robust, over))
             wide = known.quantile[index] * known.deviation[index] / reach[index]

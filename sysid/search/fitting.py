@@ -127,7 +127,7 @@ def fit_log(
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, chosen, profiles = gradient_search(chosen, space, points, iterations, config, stages)
+        search, chosen, profiles = gradient_search(chosen, points, iterations, config, stages)
         u, final_cost = search.u, search.cost
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
@@ -193,8 +193,8 @@ def choose(
     if config.method in GLOBAL:
         return objective
     progress = stages.begin("whole poses") if stages else None
-    near = least_squares.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
-                        progress=progress)
+    near = least_squares.fit(objective, starts=u[None], stop=least_squares.Stopping(TRIED), robust=config.robust,
+                             progress=progress)
     share = uncertainty.inflation(objective, near.u)
     chosen: Objective | FeatureObjective = objective
     if config.method == "features" and share >= TOGETHER:

@@ -79,7 +79,8 @@ def chosen_sizes(
         return Choice((), u, cost)
     names = tuple(name for name, one in zip(space.names, held[best], strict=True) if one)
     begin = follow(held[best], np.ones(evidence.scores.shape[:2], bool))
-    found = least_squares.fit(objective, space, starts=begin[None], iterations=ITERATIONS, robust=robust, frozen=names)
+    found = least_squares.fit(objective, starts=begin[None], stop=least_squares.Stopping(ITERATIONS), robust=robust,
+                              frozen=names)
     return Choice(options[best], found.u, found.cost)
 
 
