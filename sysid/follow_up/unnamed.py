@@ -32,7 +32,7 @@ from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.replay.models import with_effects
 from sysid.replay.quotients import Quotients
-from sysid.replay.records import Plant
+from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from sysid.verdict.result import Result
@@ -104,8 +104,8 @@ class Bench:
         self.names = [name for name in describe(self.params) if name.startswith("unnamed.")] + self.base_names
         self.neutral = np.asarray(get_values(self.params, self.names), float)
         self.u = base.u
-        drives = make_drives(result.plant, self.params, self.names, result.log.training, reference.width,
-                             gyro=reference.gyro)
+        drives = make_drives(FreeVehicle(result.plant, self.params, tuple(self.names)), result.log.training,
+                             reference.width, gyro=reference.gyro)
         self.drives = drives.weighted(drives.simulate(self.neutral[None])[0], reference.factors, result.log.spec.track)
         weight = 0.01 * result.log.spec.mass * 9.81
         self.sizes = np.repeat([weight, weight * result.log.spec.track / 2], KNOTS)  # N, N m

@@ -81,6 +81,8 @@ class FittedVehicle:
 
     params: Any
     statistics: FitStatistics | None = None
+    kept: bool = True
+    """False where a fit only starts at it."""
 
 
 def load_fitted(path: Path) -> tuple[VehicleSpec, FittedVehicle]:

@@ -28,6 +28,7 @@ import numpy as np
 from flax import struct
 
 from sysid.replay.models import Bounds, Model, Parameters, Twin, make_parameters, with_surroundings
+from sysid.replay.records import Plant
 from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
@@ -92,8 +93,7 @@ def mjcf_model(
         world = host.geom_bodyid == 0
         room_fixed = bool((host.geom_type[world] != int(mujoco.mjtGeom.mjGEOM_PLANE)).any())
     params = make_parameters(bounds, room_fixed=room_fixed)
-    plant = with_surroundings(*_functions(robot, entries), dt=float(host.opt.timestep),
-                              wheel_radius=robot.wheel_radius, track=robot.track, drive=RobotDrive(robot, entries))
+    plant = with_surroundings(_bare(robot, entries), robot.wheel_radius, robot.track, RobotDrive(robot, entries))
 
     def write(folder: Path, params: Parameters) -> Path:
         return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
@@ -155,8 +155,8 @@ def _searched(
     return bounds, entries
 
 
-def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, Any, Any, Any]:
-    """place, substep, observe and move of `with_surroundings`."""
+def _bare(robot: Robot, entries: Mapping[str, Entry | Size]) -> Plant:
+    """The model by itself, as of `with_surroundings`."""
     mjx = import_mjx()
     host, root, speed = robot.host, robot.root, robot.speed
     try:
@@ -231,7 +231,7 @@ def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, 
         qpos, qvel = at(state.qpos, state.qvel, start)
         return state.replace(qpos=qpos, qvel=qvel, warm=jnp.zeros_like(state.warm))  # type: ignore[attr-defined]
 
-    return place, substep, observe, move
+    return Plant(place, substep, observe, float(host.opt.timestep), move)
 
 
 def _may_abort(host: mujoco.MjModel) -> bool:

@@ -93,6 +93,6 @@ def fitted(result: Result, delay: float) -> np.ndarray:
     vehicle = set_values(result.full, names, jnp.asarray(values, jnp.result_type(float)))
     space = make_space(vehicle, result.log.spec, list(reference.space.names))
     first = space.to_unit(reference.space.initial)
-    u = fit_poses(drives, result.log.training, space, values, reference.spread, ITERATIONS, first[None])
+    u = fit_poses(drives, space, values, reference.spread, ITERATIONS, first[None])
     found = space.to_values(space.to_unit(space.initial) if u is None else u)
     return with_values(values, names, dict(zip(space.names, found.tolist(), strict=True)))

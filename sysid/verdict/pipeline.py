@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
+from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import Reference
-from sysid.missing.drives import make_drives
+from sysid.missing.drives import Drives, make_drives
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
@@ -36,45 +37,41 @@ from sysid.verdict.sensor_noise import compared, with_noise
 
 def find_missing(
     log: Log, references: Sequence[Log] = (), config: LoopConfig | None = None, vehicle: Any = None,
-    progress: Progress | None = None, reference: Reference | Prepared | None = None, start: Any = None,
+    progress: Progress | None = None, reference: Reference | Prepared | None = None,
 ) -> Result:
     """Verdict on the training trials of a log; its held-out trials are not looked at.
 
     Args:
         log: the drives in question.
         references: drives of the same vehicle on other days.
-        vehicle: `VehicleParams` fitted before, kept as the reference; or `FittedVehicle`, with what its fit knows.
-        start: `VehicleParams` where the fit of the base model starts, instead of the preset.
+        vehicle: `VehicleParams` fitted before, kept as the reference; or `FittedVehicle`, with what its fit knows, or
+            from which the fit of the base model starts.
         reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
     config = config or LoopConfig()
     check_logs(log, references)
     if log.fields.get("pose_stamps") == "receipt":
         config = replace(config, pose_delay=True)
-    began = time.perf_counter()
+    alpha, began = config.thresholds.alpha, time.perf_counter()
     if reference is None:
-        reference = reference_for(log, references, config, vehicle, progress, start)
-    ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
-    ready = ready.without(config.without)
-    reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
+        reference = reference_for(log, references, config, vehicle, progress)
+    usual = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
+    usual = usual.without(config.without)
     fitted = time.perf_counter()
-    base = base_values(full)
-    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths, reference.gyro)
-    at = drives.simulate(np.array([base[name] for name in names])[None])[0]
-    drives = drives.weighted(at, reference.factors, log.spec.track)
-    noise = compared(drives, at, reference, config.thresholds.alpha)
-    usual, ready = ready, with_noise(ready, noise)
-    reference = ready.reference
-    evidence, slopes = gather(drives, reference, found, full, progress)
+    drives, noise = _measured(log, usual, alpha)
+    ready = with_noise(usual, noise)
+    evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
     gathered = time.perf_counter()
-    refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
+    base = base_values(ready.full)
+    refitter = Refitter(drives, ready.reference, np.array([base[name] for name in ready.names]), slopes)
     draws = min(config.draws, 300) if config.quick else config.draws
 
     def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
+        return best_gain(log.training, log.spec, residual, ready.reference.width, ready.reference.channels)
 
-    asked = begin(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
-    alone = stands_alone(log.training, reference.known)
+    asked = begin(evidence, ready.hypotheses, refitter, ready.wander, config.thresholds, anything, draws, config.seed,
+                  progress)
+    alone = stands_alone(log.training, ready.reference.known)
     judge: Callable[[Asked, PairScan | None], Search] = settle
     if alone:
         judge = partial(search_alone, wheels=any(trial.odometry is not None for trial in log.training))
@@ -88,30 +85,44 @@ def find_missing(
         nulls = run_null_refits(replace(asked, wander=usual.wander), judge, pairs, config.refit_nulls,
                                 config.seed, progress)
         outcome = checked(outcome, nulls, ready.wander, config.thresholds)
-    stood: tuple[Stood, ...] = ()
-    if outcome.verdict == "named":
-        # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
-        p_excess = (lambda _: 1.0) if alone else usual.wander.p_excess
-        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, p_excess))
-        outcome = guarded(outcome, stood, config.thresholds)
+    # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
+    outcome, stood = _stood(outcome, asked, log, (lambda _: 1.0) if alone else usual.wander.p_excess)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    floor = floor_change(reference, log.training, config.thresholds.alpha)
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise, floor)
-    if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
-        result = told_late(result, config.thresholds.alpha)
-    return result
+    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise,
+                    floor_change(ready.reference, log.training, alpha))
+    late = alone and config.pose_delay and PARAMETER not in (*ready.reference.space.names, *config.held)
+    return told_late(result, alpha) if late else result
+
+
+def _measured(log: Log, ready: Prepared, alpha: float) -> tuple[Drives, NoiseLevels | None]:
+    """The drives, weighted by the noise that their motion has, and how that compares with the reference days."""
+    reference, base = ready.reference, base_values(ready.full)
+    drives = make_drives(ready.vehicle, log.training, reference.width, ready.paths, reference.gyro)
+    at = drives.simulate(np.array([base[name] for name in ready.names])[None])[0]
+    drives = drives.weighted(at, reference.factors, log.spec.track)
+    return drives, compared(drives, at, reference, alpha)
+
+
+def _stood(outcome: Search, asked: Asked, log: Log, p_excess: Callable[[float], float]
+           ) -> tuple[Search, tuple[Stood, ...]]:
+    """The verdict after what a name must stand, and that; `p_excess` as of `stand`."""
+    if outcome.verdict != "named":
+        return outcome, ()
+    stood = tuple(stand(outcome, asked.refitter, log.training, asked.evidence.groups, log.spec.track, p_excess))
+    return guarded(outcome, stood, asked.thresholds), stood
 
 
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
     """`find_missing` with a progress bar. With references, `vehicle` is where the fit to them starts."""
-    start = None if vehicle is None or not references else vehicle.params
-    kept = vehicle if start is None else None
+    if vehicle is not None:
+        vehicle = replace(vehicle, kept=not references)
+    kept = vehicle is not None and vehicle.kept
     progress, close = command_line.progress_bar(
-        expected_steps(config, len(days_of(references)), kept is not None), "close the loop", "step")
+        expected_steps(config, len(days_of(references)), kept), "close the loop", "step")
     progress(0, "reference vehicle")
     try:
-        return find_missing(log, references, config, kept, progress, start=start)
+        return find_missing(log, references, config, vehicle, progress)
     finally:
         close()
 

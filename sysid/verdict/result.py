@@ -15,7 +15,7 @@ from sysid.logs.records import Log
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Reference, Wander
 from sysid.missing.evidence import Evidence, column_layout
-from sysid.replay.records import Plant
+from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay
 from sysid.verdict.agreement import Heterogeneity
 from sysid.verdict.falsifiers import Tested, in_words
@@ -97,6 +97,11 @@ class Prepared:
     wander: Wander
     others: dict[Any, PathReplay] = field(default_factory=dict)
     """Compiled replays of vehicles with effects that the catalogue does not have, by plant and structure."""
+
+    @property
+    def vehicle(self) -> FreeVehicle:
+        """With every parameter free that has an effect in the catalogue or in the base model."""
+        return FreeVehicle(self.plant, self.full, self.names)
 
     def without(self, effects: Sequence[str]) -> Prepared:
         """The same without some effects of the catalogue; nothing is compiled or simulated again."""

@@ -444,7 +444,7 @@ def test_replicates_move_alike_unless_the_room_does_something(drives, sloping):
     for one in ready.hypotheses:
         row = {**base, **one.values(np.ones(len(one.axes)), base)}
         values.append([row[name] for name in base])
-    made = make_drives(ready.plant, ready.full, ready.names, drives["plain"].training, paths=ready.paths)
+    made = make_drives(ready.vehicle, drives["plain"].training, paths=ready.paths)
     once = made.simulate(np.array(values))
     every = replace(made, courses=replace(made.courses, shared=False)).simulate(np.array(values))
     assert len(made.courses.first) == 3 < len(made.trials)
