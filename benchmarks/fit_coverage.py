@@ -82,10 +82,11 @@ def plant_log(folder: Path, seed: int, vehicle: str = "chair") -> tuple[Log, dic
     """A log of a day of one of the contact plant's vehicles, and the values of the physical model that are known."""
     from benchmarks.plant.chair import COULOMB, VEHICLES
     from benchmarks.plant.commands import nine
-    from benchmarks.plant.make import make_log
+    from benchmarks.plant.make import Experiment, make_log
 
     tables = {name: table[table[:, 0] < PLANT_LENGTH] for name, table in nine(seed).items() if name in PLANT_MANOEUVRES}
-    make_log(folder / "log", seed=seed, manoeuvres=tables, replicates=REPLICATES, contact=COULOMB, vehicle=vehicle)
+    make_log(folder / "log", Experiment(seed=seed, manoeuvres=tables, replicates=REPLICATES, contact=COULOMB,
+             vehicle=vehicle))
     log = load_log(folder / "log")
     log = replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
     return log, plant_values(VEHICLES[vehicle].on_day(np.random.default_rng([seed, 1])), log.spec)

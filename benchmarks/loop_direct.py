@@ -14,6 +14,7 @@ from pathlib import Path
 from benchmarks.loop_drives import SLEW, Plan, recorded
 from benchmarks.plant.base import TICK
 from benchmarks.plant.chair import Nominal
+from benchmarks.plant.make import Experiment
 from benchmarks.plant.make import plan as plan_day
 from benchmarks.plant.online import OnlinePlant
 from bridge.command_table import PERIOD, CommandTable, make_table, read_commands
@@ -43,7 +44,7 @@ def drive_directly(
         vehicle="contact plant", wheel_radius=nominal.radius, track=nominal.track, wheelbase=nominal.wheelbase,
         mass=nominal.mass, v_limit=1.0, omega_limit=1.0, odometry_topic="none", ground_truth_topic="none",
         held_out=list(held_out)))
-    plant = OnlinePlant(plan_day(effects, seed, 1.0, True)[0])
+    plant = OnlinePlant(plan_day(Experiment(effects, seed, 1.0, True))[0])
     limit, steepest = LIMITS, (float(SLEW[0]), float(SLEW[1]))
     for number, one in enumerate(plans):
         table = make_table(read_commands(one.commands), (-limit[0], -limit[1]), limit, steepest, str(one.commands))

@@ -120,24 +120,38 @@ def drive_plans(here: Station, plans: Sequence[Plan], dataset: Path, plant: Sequ
     client = EpisodeClient(_port(here, process))
     operator = Robot(here.domain, "operator")
     operator.watch()
+    session = _Session(here, operator, client, dataset, record)
     try:
         for number, plan, done in missing:
-            _drive(here, operator, client, dataset, plan, done, 100 * (number + 1), record)
+            _drive(session, plan, done, 100 * (number + 1))
     finally:
         operator.close()
         client.close()
         here.end("plant")
 
 
-def _drive(here: Station, operator: Robot, client: EpisodeClient, dataset: Path, plan: Plan, done: int, index: int,
-           record: Sequence[str]) -> None:
+@dataclass(frozen=True)
+class _Session:
+    """A plant that runs, who operates it, and what its drives are recorded into."""
+
+    here: Station
+    operator: Robot
+    client: EpisodeClient
+    dataset: Path
+    record: Sequence[str]
+    """Options of `bridge.manoeuvre` on what dataset.toml says."""
+
+
+def _drive(session: _Session, plan: Plan, done: int, index: int) -> None:
     """Drive the replicates of a manoeuvre that are missing; the operator brings the vehicle back and arms."""
+    here, operator = session.here, session.operator
     operator.statuses.clear()
     left = plan.replicates - done
     name = f"manoeuvre_{plan.name}"
-    process = here.start(name, "bridge.manoeuvre", str(plan.commands), "--trial", plan.name, "--dataset", str(dataset),
-                         "--first", str(done + 1), "--repeat", str(left), "--space", *SPACE, "--slew", *SLEW,
-                         "--base", "generic", "--time", "stamp", *plan.check, *record,
+    process = here.start(name, "bridge.manoeuvre", str(plan.commands), "--trial", plan.name,
+                         "--dataset", str(session.dataset), "--first", str(done + 1), "--repeat", str(left),
+                         "--space", *SPACE, "--slew", *SLEW, "--base", "generic",
+                         "--time", "stamp", *plan.check, *session.record,
                          "--ros-args", "-p", "use_sim_time:=true")
 
     def progress() -> tuple[int, int]:
@@ -170,7 +184,7 @@ def _drive(here: Station, operator: Robot, client: EpisodeClient, dataset: Path,
             if before[1] + refused > TRIES:
                 raise StageError(f"{plan.name} was stopped {before[1]} times; see {here.log(name)}")
             if process.poll() is None:
-                client.call("reset", seed=index + done + before[0], **(plan.start or {}))
+                session.client.call("reset", seed=index + done + before[0], **(plan.start or {}))
                 operator.arm()
                 if not moves(before):
                     refused += 1
