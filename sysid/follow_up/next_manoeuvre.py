@@ -21,9 +21,7 @@ import numpy as np
 from sysid.logs.manoeuvre_library import OWN, REVERSING, make_command
 from sysid.logs.metrics import ideal_replay
 from sysid.logs.records import Command, GyroStream, OdometryStream, PoseStream, Start, Trial
-from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.drives import Drives
-from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit
 from sysid.missing.joint_fit import Start as FitStart
 from sysid.missing.refit import Refitter, own_sizes
@@ -229,8 +227,9 @@ def separations(
     best = np.unique(np.argsort(-raw, axis=0)[: max(REFINED // len(pairs), 4)])  # each pair's own best
     chosen = [library[i] for i in best]
     seen, drives = _seen(result, refitter, flat, chosen)
-    base = _white(result, drives, base_columns(drives, result.reference, refitter.values, result.names))
-    columns = [np.concatenate([base, _own_columns(result, drives, one.fit, seen[i])], axis=-1)
+    white = result.reference.whitener.flat
+    base = white(base_columns(drives, result.reference, refitter.values, result.names), drives.mask)
+    columns = [np.concatenate([base, _own_columns(refitter, drives, one.fit, seen[i])], axis=-1)
                for i, one in enumerate(flat)]
     held = [_held(result, one.fit) for one in flat]
     inflation = math.sqrt(1 + max(result.search.excess[1], 0.0))
@@ -256,31 +255,15 @@ def _seen(result: Result, refitter: Refitter, rivals: Sequence[Rival], library: 
     drives = plan_drives(result, refitter.drives, library)
     features = drives.simulate(np.stack([one.fit.values for one in rivals]))
     drives = drives.weighted(features[0], result.reference.factors, result.log.spec.track)
-    return np.stack([_white(result, drives, one) for one in features]), drives
+    return np.stack([result.reference.whitener.flat(one, drives.mask) for one in features]), drives
 
 
-def _white(result: Result, drives: Drives, series: np.ndarray) -> np.ndarray:
-    """(D, n, ...) white and flat, of (D, K, C, ...)."""
-    white = result.reference.whitener.apply(series, drives.mask)
-    return white.reshape(len(white), -1, *series.shape[3:])
-
-
-def _own_columns(result: Result, drives: Drives, fit: Refit, at: np.ndarray) -> np.ndarray:
+def _own_columns(refitter: Refitter, drives: Drives, fit: Refit, at: np.ndarray) -> np.ndarray:
     """(D, n, k) derivative of the white features by a rival's own coordinates, by differences."""
     own = Quotients.forward(fit.q, own_sizes(fit.q))
-    seen = drives.simulate(np.stack([_values(result, fit.hypotheses, fit.u, q) for q in own.above]))
-    return np.asarray(own.slopes(np.stack([_white(result, drives, one) for one in seen]), at))
-
-
-def _values(result: Result, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """All parameters of the vehicle at base coordinates u (P,) and the hypotheses' own q (k,)."""
-    base = base_values(result.full)
-    base.update(zip(result.reference.space.names, result.reference.space.to_values(u).tolist(), strict=True))
-    values = np.array([base[name] for name in result.names])
-    parts = np.split(q, np.cumsum([len(one.axes) for one in hypotheses])[:-1])
-    for one, part in zip(hypotheses, parts, strict=True):
-        values = with_values(values, result.names, one.values(part, base))
-    return values
+    seen = drives.simulate(np.stack([refitter.values_at(fit.hypotheses, fit.u, q) for q in own.above]))
+    white = refitter.reference.whitener.flat
+    return np.asarray(own.slopes(np.stack([white(one, drives.mask) for one in seen]), at))
 
 
 def _held(result: Result, fit: Refit) -> np.ndarray:

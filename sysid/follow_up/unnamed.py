@@ -124,8 +124,7 @@ class Bench:
 
     def white(self, drives: Drives, series: np.ndarray) -> np.ndarray:
         """(B, n, ...) white and flat, of (B, K, C, ...)."""
-        white = self.result.reference.whitener.apply(series, drives.mask)
-        return white.reshape(len(white), -1, *series.shape[3:])
+        return self.result.reference.whitener.flat(series, drives.mask)
 
     def residual(self, points: Sequence[tuple[np.ndarray, np.ndarray]], table: Table, phases: np.ndarray) -> np.ndarray:
         """(N, B, n) white residual of all training trials at base coordinates and wrenches, with each trial's turn."""

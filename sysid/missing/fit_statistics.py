@@ -127,7 +127,7 @@ def leftovers_in_bins(
 ) -> Leftovers:
     """Statistics of leftovers (B, K, C) with weights of bins (B, K, C) and noise factors (4, C)."""
     whitener = fit_whitener(series, mask)
-    white = whitener.apply(series, mask).reshape(len(trials), -1)
+    white = whitener.flat(series, mask)
     courses = np.zeros(len(trials), int)
     for number, group in enumerate(replicate_groups(trials)):
         courses[group] = number

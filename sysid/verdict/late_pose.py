@@ -79,8 +79,8 @@ def residuals(result: Result, values: np.ndarray) -> np.ndarray:
     drives, before = drives_of(result, result.log.training, reference.params)
     at = drives.simulate(before[None])[0]
     drives = drives.weighted(at, reference.factors, result.log.spec.track)
-    left = [reference.whitener.apply(reference.target_of(drives) - one, drives.mask) for one in drives.simulate(values)]
-    return np.stack([one.reshape(len(one), -1) for one in left])
+    target = reference.target_of(drives)
+    return np.stack([reference.whitener.flat(target - one, drives.mask) for one in drives.simulate(values)])
 
 
 def fitted(result: Result, delay: float) -> np.ndarray:

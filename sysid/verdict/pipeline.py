@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
-from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log
-from sysid.missing.catalogue import PARAMETER, base_values
+from sysid.missing.catalogue import PARAMETER
 from sysid.missing.days import Reference
-from sysid.missing.drives import Drives, make_drives
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
@@ -58,12 +56,12 @@ def find_missing(
     usual = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
     usual = usual.without(config.without)
     fitted = time.perf_counter()
-    drives, noise = _measured(log, usual, alpha)
+    drives, at = usual.drives(log.training, log.spec.track)
+    noise = compared(drives, at, usual.reference, alpha)
     ready = with_noise(usual, noise)
     evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
     gathered = time.perf_counter()
-    base = base_values(ready.full)
-    refitter = Refitter(drives, ready.reference, np.array([base[name] for name in ready.names]), slopes)
+    refitter = Refitter(drives, ready.reference, ready.values, slopes)
     draws = min(config.draws, 300) if config.quick else config.draws
 
     def anything(residual: np.ndarray) -> float:
@@ -93,15 +91,6 @@ def find_missing(
                     floor_change(ready.reference, log.training, alpha))
     late = alone and config.pose_delay and PARAMETER not in (*ready.reference.space.names, *config.held)
     return told_late(result, alpha) if late else result
-
-
-def _measured(log: Log, ready: Prepared, alpha: float) -> tuple[Drives, NoiseLevels | None]:
-    """The drives, weighted by the noise that their motion has, and how that compares with the reference days."""
-    reference, base = ready.reference, base_values(ready.full)
-    drives = make_drives(ready.vehicle, log.training, reference.width, ready.paths, reference.gyro)
-    at = drives.simulate(np.array([base[name] for name in ready.names])[None])[0]
-    drives = drives.weighted(at, reference.factors, log.spec.track)
-    return drives, compared(drives, at, reference, alpha)
 
 
 def _stood(outcome: Search, asked: Asked, log: Log, p_excess: Callable[[float], float]

@@ -11,9 +11,10 @@ import numpy as np
 
 from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.floor import FloorChange
-from sysid.logs.records import Log
-from sysid.missing.catalogue import Hypothesis
+from sysid.logs.records import Log, Trial
+from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.days import Reference, Wander
+from sysid.missing.drives import Drives, make_drives
 from sysid.missing.evidence import Evidence, column_layout
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay
@@ -102,6 +103,20 @@ class Prepared:
     def vehicle(self) -> FreeVehicle:
         """With every parameter free that has an effect in the catalogue or in the base model."""
         return FreeVehicle(self.plant, self.full, self.names)
+
+    @property
+    def values(self) -> np.ndarray:
+        """(all,) of these parameters."""
+        base = base_values(self.full)
+        return np.array([base[name] for name in self.names])
+
+    def drives(self, trials: tuple[Trial, ...], track: float) -> tuple[Drives, np.ndarray]:
+        """Drives of trials, weighted by the noise that their motion has, and their features (B, K, C) without any
+        effect."""
+        reference = self.reference
+        drives = make_drives(self.vehicle, trials, reference.width, self.paths, reference.gyro)
+        at = drives.simulate(self.values[None])[0]
+        return drives.weighted(at, reference.factors, track), at
 
     def without(self, effects: Sequence[str]) -> Prepared:
         """The same without some effects of the catalogue; nothing is compiled or simulated again."""

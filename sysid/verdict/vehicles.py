@@ -116,11 +116,8 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[
 
 def refitter_of(result: Result) -> Refitter:
     """A refitter like that of the search, through the replay that it compiled."""
-    base = base_values(result.full)
-    values = np.array([base[name] for name in result.names])
-    drives = make_drives(result.prepared.vehicle, result.log.training, result.reference.width, result.prepared.paths,
-                         result.reference.gyro)
-    drives = drives.weighted(drives.simulate(values[None])[0], result.reference.factors, result.log.spec.track)
+    values = result.prepared.values
+    drives, _ = result.prepared.drives(result.log.training, result.log.spec.track)
     return Refitter(drives, result.reference, values, base_columns(drives, result.reference, values, result.names))
 
 
