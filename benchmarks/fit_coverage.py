@@ -24,7 +24,7 @@ from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
 from sysid.errors.space import NUISANCE, Space, make_space, searched
-from sysid.intervals.independence import Evidence
+from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import Estimate, estimate, uncertainty_of
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
@@ -177,7 +177,7 @@ def _rows(estimates: Sequence[Estimate], truth: Mapping[str, float]) -> dict[str
                        "identifiable": one.identifiable} for one in estimates if one.name in truth}
 
 
-def save_evidence(path: Path, evidence: Evidence, space: Space) -> None:
+def save_evidence(path: Path, evidence: Information, space: Space) -> None:
     """Keep the evidence of a log, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
@@ -202,7 +202,7 @@ def judged_again(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
                   *(arrays.pop(name) for name in ("low", "high", "initial", "log")))
     numbers: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in arrays.items()}
     known = {name: row["truth"] for name, row in result["parameters"].items()}
-    estimates = uncertainty_of(Evidence(**numbers), space).estimates
+    estimates = uncertainty_of(Information(**numbers), space).estimates
     return {**result, "parameters": _rows(estimates, known)}
 
 

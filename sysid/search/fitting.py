@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
-from sysid.errors.pose_objective import Noise, Objective, Told, estimate_noise
+from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, estimate_noise
 from sysid.errors.prior import Prior, bounds_alone, make_prior
 from sysid.errors.robust import robust_cost
 from sysid.errors.space import Space, make_space, searched
@@ -119,7 +119,7 @@ def fit_log(
     scan, coarse, points = _first_points(log, given, config, stages)
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
-    chosen: Told = choose(objective, points[0], log.spec.track, config, stages)
+    chosen: DriveResiduals = choose(objective, points[0], log.spec.track, config, stages)
     robust, search = config.robust and config.method not in GLOBAL, None
     stated: tuple[str, ...] = ()
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
@@ -179,7 +179,7 @@ def _first_points(
 
 def choose(
     objective: Objective, u: np.ndarray, track: float, config: FitConfig, stages: Stages | None = None
-) -> Told:
+) -> DriveResiduals:
     """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count what they
     tell.
 

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from sysid.errors.bin_objective import FeatureObjective
-from sysid.errors.pose_objective import Told
+from sysid.errors.pose_objective import DriveResiduals
 from sysid.search import least_squares, slopes
 from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import FitConfig
@@ -30,8 +30,8 @@ WORTH = 0.001  # share of the cost that another valley must save for the floor t
 
 
 def gradient_search(
-    objective: Told, starts: np.ndarray, iterations: int, config: FitConfig, stages: Stages | None
-) -> tuple[FitResult, Told, list[tuple[str, np.ndarray, np.ndarray]]]:
+    objective: DriveResiduals, starts: np.ndarray, iterations: int, config: FitConfig, stages: Stages | None
+) -> tuple[FitResult, DriveResiduals, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
 
     What drives hardly determine, such as how far a suspension sags, may be right in another valley, and the range
@@ -46,10 +46,10 @@ def gradient_search(
     binned = isinstance(objective, FeatureObjective)
     progress = stages.begin("motion in bins" if binned else "whole poses to the end") if stages else None
 
-    def search(objective: Told, starts: np.ndarray, iterations: int) -> FitResult:
+    def search(objective: DriveResiduals, starts: np.ndarray, iterations: int) -> FitResult:
         return from_all(objective, starts, iterations, config.robust, progress)
 
-    def renew(objective: Told, result: FitResult, starts: np.ndarray) -> tuple[Told, FitResult]:
+    def renew(objective: DriveResiduals, result: FitResult, starts: np.ndarray) -> tuple[DriveResiduals, FitResult]:
         """With the noise that the result leaves, searched again from starts (S, P) where that changes it."""
         again = objective.renewed(result.u)
         return (objective, result) if again is objective else (again, search(again, starts, iterations))
@@ -89,7 +89,8 @@ def gradient_search(
 
 
 def from_all(
-    objective: Told, starts: np.ndarray, iterations: int, robust: bool = False, progress: Progress | None = None
+    objective: DriveResiduals, starts: np.ndarray, iterations: int, robust: bool = False,
+    progress: Progress | None = None,
 ) -> FitResult:
     """LM from all starts (S, P), on what is quicker as long as that leads on."""
     quicker, spent = getattr(objective, "quicker", objective), 0
@@ -103,7 +104,7 @@ def from_all(
 
 
 def _from_ends(
-    search: Callable[[np.ndarray, int], FitResult], objective: Told, result: FitResult, iterations: int,
+    search: Callable[[np.ndarray, int], FitResult], objective: DriveResiduals, result: FitResult, iterations: int,
     robust: bool,
 ) -> FitResult:
     """The result with where searches from those ends of ranges lead that cost little. An end that costs what is here

@@ -12,7 +12,7 @@ from sysid.logs.records import Trial, command_in_force
 from sysid.missing.joint_fit import Refit, moved_last, without_each
 from sysid.missing.refit import Refitter
 from sysid.verdict.agreement import beside
-from sysid.verdict.falsifiers import QUIET, SPLITS, Course, Tested
+from sysid.verdict.falsifiers import QUIET, SPLITS, BinnedCourse, Tested
 from whill_mjx.effects import card_of
 from whill_mjx.effects.card import Falsifier
 
@@ -131,7 +131,7 @@ def _gain(fit: Refit, count: int, precision: np.ndarray) -> float:
     return max(float(q @ beside(fit.products(precision), count) @ q), 1e-9)
 
 
-def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, track: float) -> Course:
+def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, track: float) -> BinnedCourse:
     """The course of trials, from simulated features (B, K, 5) and their commands."""
     bins = simulated.shape[1]
     t = (np.arange(bins) + 0.5) * width
@@ -141,7 +141,7 @@ def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, trac
     heading = start + np.cumsum(omega * width, axis=1) - omega * width / 2
     rows = [_changes(trial, t, track) for trial in trials]
     asked, step, rising, since = (np.stack([row[k] for row in rows]) for k in range(4))
-    return Course(t, v, omega * track / 2, omega, heading, asked, step, rising, since)
+    return BinnedCourse(t, v, omega * track / 2, omega, heading, asked, step, rising, since)
 
 
 def _changes(trial: Trial, t: np.ndarray, track: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

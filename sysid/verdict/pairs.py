@@ -27,7 +27,7 @@ CHI_SQUARED = 2.0
 """Size over which the tail of chi-squared falls by e."""
 
 
-class Bench:
+class PairSolver:
     """Scores and information of all columns beside the base, of the drives (row 0) and of simulated nulls."""
 
     def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, nulls: NullDays):
@@ -89,7 +89,7 @@ def scan_pairs(
     """
     members = tuple((i, j) for i, j in combinations(range(len(hypotheses)), 2)
                     if hypotheses[i].effect != hypotheses[j].effect and max(similar[i, j], similar[j, i]) <= alike)
-    gain, worth, found, null = _looked(Bench(evidence, hypotheses, wander, nulls), hypotheses, members)
+    gain, worth, found, null = _looked(PairSolver(evidence, hypotheses, wander, nulls), hypotheses, members)
     p, smallest = np.ones(len(members)), np.ones(len(null))
     for m in range(len(members)):
         p[m] = float(tail(null[:, m], worth[m]))
@@ -100,13 +100,13 @@ def scan_pairs(
 def scan_again(first: PairScan, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander) -> PairScan:
     """The same pairs on other drives of the same commands, held against the nulls of a scan made before."""
     nothing = NullDays(np.zeros((0, evidence.products.shape[1])), np.zeros((0, len(wander.shapes[0]))))
-    gain, worth, found, _ = _looked(Bench(evidence, hypotheses, wander, nothing), hypotheses, first.members)
+    gain, worth, found, _ = _looked(PairSolver(evidence, hypotheses, wander, nothing), hypotheses, first.members)
     p = np.array([float(tail(first.null[:, m], worth[m])) for m in range(len(first.members))])
     return replace(first, gain=gain, worth=worth, q=found, p=p)
 
 
 def _looked(
-    bench: Bench, hypotheses: Sequence[Hypothesis], members: Sequence[tuple[int, int]]
+    bench: PairSolver, hypotheses: Sequence[Hypothesis], members: Sequence[tuple[int, int]]
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
     """Gain (M,), worth (M,) and coordinates of pairs at the levels of their highest worth; worth (N, M) on nulls."""
     placed: list[list[int]] = [[] for _ in hypotheses]

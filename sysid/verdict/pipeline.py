@@ -27,7 +27,7 @@ from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
-from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
+from sysid.verdict.result import LoopConfig, Prepared, Result, Support
 from sysid.verdict.rounds import Asked, begin
 from sysid.verdict.search import pairs_of, settle
 from sysid.verdict.sensor_noise import compared, with_noise
@@ -94,7 +94,7 @@ def find_missing(
 
 
 def _stood(outcome: Search, asked: Asked, log: Log, p_excess: Callable[[float], float]
-           ) -> tuple[Search, tuple[Stood, ...]]:
+           ) -> tuple[Search, tuple[Support, ...]]:
     """The verdict after what a name must stand, and that; `p_excess` as of `stand`."""
     if outcome.verdict != "named":
         return outcome, ()

@@ -26,7 +26,7 @@ from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
 
 @dataclass(frozen=True)
-class Stood:
+class Support:
     """What speaks for one effect of a joint fit, and against it."""
 
     effect: str
@@ -141,7 +141,7 @@ class Result:
     evidence: Evidence
     seconds: dict[str, float]
     null_refits: NullRefits | None = None
-    stood: tuple[Stood, ...] = ()
+    stood: tuple[Support, ...] = ()
     """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
     noise: NoiseLevels | None = None
     """Noise of each channel over that of the reference days; None without such days."""

@@ -12,7 +12,7 @@ from sysid.errors.features import CHANNELS, make_features
 from sysid.errors.noise import deviations, replicate_groups
 from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
-from sysid.follow_up.tables import Table
+from sysid.follow_up.tables import WrenchTable
 from sysid.follow_up.trust import advice, as_good_as_repeats, beside_still_base, warnings
 from sysid.follow_up.unnamed import vehicle_of, with_start_angles
 from sysid.logs.log import load_log
@@ -395,7 +395,7 @@ def test_refit_to_poses_lowers_the_training_error(drives, sloping):
 def test_a_wrench_without_a_name_is_there_when_its_vehicle_is_replayed(drives, sloping):
     """Refits to poses replay like this too: without the wrench, base parameters would move to stand for it."""
     trials = tuple(one for one in drives["plain"].training if one.name == "straight_1")
-    push = Table("speed", "push", -1.0, 1.0).parameters(np.repeat([-20.0, 0.0], KNOTS), 0.0)
+    push = WrenchTable("speed", "push", -1.0, 1.0).parameters(np.repeat([-20.0, 0.0], KNOTS), 0.0)
     pushed = vehicle_of(sloping, {f"unnamed.{name}": value for name, value in push.items()})
     [free], [held] = (replay(sloping, one, trials) for one in (sloping.reference.params, pushed))
     ends = [np.array([one.ground_truth.x[-1], one.ground_truth.y[-1]]) for one in (free, held)]
@@ -405,7 +405,7 @@ def test_a_wrench_without_a_name_is_there_when_its_vehicle_is_replayed(drives, s
 def test_replicates_start_at_their_own_angle_of_a_wheel_that_is_out_of_balance(drives, sloping):
     trials = tuple(one for one in drives["plain"].training if one.name in ("straight_1", "straight_2"))
     force = 40 * np.sin(np.arange(KNOTS) * 2 * np.pi / KNOTS)
-    push = Table("left wheel's angle", "push", 0.0, 1.0).parameters(np.concatenate([force, np.zeros(KNOTS)]), 0.0)
+    push = WrenchTable("left wheel's angle", "push", 0.0, 1.0).parameters(np.concatenate([force, np.zeros(KNOTS)]), 0.0)
     pushed = vehicle_of(sloping, {f"unnamed.{name}": value for name, value in push.items()})
     speeds = []
     for angles in ([0.0, 0.0], [0.0, np.pi]):

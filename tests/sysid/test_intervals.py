@@ -279,8 +279,9 @@ def test_an_interval_reaches_as_far_down_as_up_on_the_scale_on_which_it_is_told(
     names = ("wheel_inertia.ratio", "torque_drive.kp")
     space = Space(names, np.full(2, 0.2), np.full(2, 20.0), np.full(2, 2.0), np.ones(2, bool))
     scores = 5.0 * np.random.default_rng(0).standard_normal((12, 8, 2))
-    told = independence.Evidence(np.full(2, 0.5), scores - scores.mean((0, 1)), np.tile(9.0 * np.eye(2), (12, 8, 1, 1)),
-                                 np.arange(12) // 2, 1.0, 1.0, np.eye(2), 1.0)
+    parts = np.tile(9.0 * np.eye(2), (12, 8, 1, 1))
+    told = independence.Information(np.full(2, 0.5), scores - scores.mean((0, 1)), parts, np.arange(12) // 2, 1.0, 1.0,
+                                    np.eye(2), 1.0)
     wheels, gain = uncertainty.uncertainty_of(told, space).estimates
     assert wheels.identifiable and gain.identifiable and wheels.high > 2.5
     assert wheels.high - wheels.value == pytest.approx(wheels.value - wheels.low)

@@ -16,7 +16,7 @@ from sysid.verdict.falsifiers import QUIET, SPLITS, side
 from sysid.verdict.found import Candidate, Search
 from sysid.verdict.guards import guarded
 from sysid.verdict.posterior import Thresholds
-from sysid.verdict.result import Stood
+from sysid.verdict.result import Support
 from whill_mjx.effects import EFFECTS
 from whill_mjx.effects.card import GONE_WHEN_SETTLED, QUANTITIES, STATES, Axis, Falsifier
 from whill_mjx.vehicle.presets import preset
@@ -160,7 +160,7 @@ def test_the_course_of_a_drive_knows_its_steps_and_its_heading():
 
 def stood(outcome="agree", least=0.0, tested=(), interval=(10.0, 20.0)):
     agreement = SimpleNamespace(asked=np.ones(4, bool), outcome=outcome, least=least, scatter=2 * least)
-    return Stood("slope", np.ones(4), np.ones(4), agreement, np.ones(4), interval, tested)
+    return Support("slope", np.ones(4), np.ones(4), agreement, np.ones(4), interval, tested)
 
 
 @pytest.mark.parametrize(("one", "text"), [
