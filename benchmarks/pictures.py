@@ -2,6 +2,7 @@
 
     drive      drive.webp: a planner drives the obstacle course; camera picture beside the world from above
     loop RUN   missing_effect.png: a verdict of `sysid.close_loop`, from RUN/report.json
+    verdict FILE   verdict.svg: how a verdict was reached, from an evidence.json
     ros        ros2.png: which node publishes which topic
     map        map.png: a made map from above, and what a camera sees of its walls
 
@@ -26,6 +27,7 @@ import numpy as np
 
 from bridge.options import Parser
 from whill_mjx.io.command_line import guarded
+from whill_mjx.logs.dataset import write_text
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 CAMERA = 288
@@ -239,6 +241,7 @@ def main() -> None:
     kinds = parser.add_subparsers(dest="kind", required=True)
     kinds.add_parser("drive", help="the moving picture")
     kinds.add_parser("loop", help="a named effect").add_argument("run", type=Path, help="folder with report.json")
+    kinds.add_parser("verdict", help="how it was reached").add_argument("file", type=Path, help="evidence.json")
     kinds.add_parser("ros", help="nodes and topics")
     kinds.add_parser("map", help="a map and its walls")
     given = parser.parse_args()
@@ -248,6 +251,11 @@ def main() -> None:
         drive(IMAGES / "drive.webp")
     elif given.kind == "loop":
         loop(given.run, IMAGES / "missing_effect.png")
+    elif given.kind == "verdict":
+        from sysid.pages.verdict_picture import account, draw
+        from sysid.verdict.posterior import Thresholds, read
+
+        write_text(IMAGES / "verdict.svg", draw(account(read(given.file), Thresholds())) + "\n")
     else:
         ros(IMAGES / "ros2.png")
 

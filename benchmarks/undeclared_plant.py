@@ -112,11 +112,11 @@ def own_set_jobs(count: int, part: str) -> list[Job]:
     return [Job(f"null_own_{n:03d}", {}, OWN_SEED + n, reference=OWN_SET + n) for n in range(count) if mine(n, part)]
 
 
-def noisy_jobs(usual: Sequence[Job], levels: Sequence[float], nulls: int, part: str) -> list[Job]:
-    """Logs noisier or quieter than the reference days: with nothing in them, and those of other jobs (`scaled_jobs`,
-    `pair_jobs`) driven anew. They are mixed, so that a part of them is a fair part."""
+def noisy_jobs(usual: Sequence[Job], levels: Sequence[float], nulls: int, part: str, sets: int = 1) -> list[Job]:
+    """Logs noisier or quieter than the reference days: with nothing in them, dealt over sets of these days, and those
+    of other jobs (`scaled_jobs`, `pair_jobs`) driven anew. They are mixed, so that a part of them is a fair part."""
     listed = [(n / nulls, Job(f"noise_{level:g}_{n:03d}", {}, 20000 + n + round(1000 * (level - 1)), stage="noisy",
-                              noise=level))
+                              noise=level, reference=n % sets))
               for n in range(nulls) for level in levels]
     listed += [(n / len(usual), replace(job, label=f"{job.label}_noise_{level:g}", seed=job.seed + 4000,
                                         stage="noisy", noise=level))

@@ -31,6 +31,9 @@
                       noise, as a share of it, before and after; share `explained` of what could be predicted; of
                       simulated days that were refitted (`--refit-nulls`, else null) count, calibrated p-value, false
                       alarms and the upper 95 % bound of their rate
+    forms             per named effect curves over speed, yaw rate and time of how much larger than by its law it is:
+                      `share` of its size `at` values of the quantity, with a 95 % band (`low`, `high`)
+    decision          how the verdict was reached, as the picture of the page shows it; null for drives that stand alone
     weights           posterior weights of `none` or `noise`, of sets of effects (" + " between them), of `unknown`
     steps             the sets of effects that were weighed: gain, gain of each effect beside other forms of the others
                       (`own`) and its p-value, what is left that replicates have in common, smooth functions predict, or
@@ -94,13 +97,15 @@ from sysid.missing.unexplained import held_back_gains
 from sysid.pages.before_after import replayed_paths, shown_drive
 from sysid.pages.loop_words import FAR, describe_unnamed, lead, not_determined, sentence, title
 from sysid.pages.report import code_hashes, error_rows
+from sysid.pages.verdict_picture import account
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import as_report as predictions_of
+from sysid.verdict.forms import forms_of
 from sysid.verdict.found import EFFORT
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.scan import null_days
-from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before
+from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before, refitter_of
 from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.types import Parameter, parameters_of
@@ -160,6 +165,8 @@ def make_report(result: Result) -> dict[str, Any]:
                         "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
                         "upper": nulls.upper}},
         "weights": found.weights, "steps": steps(result),
+        "forms": form_curves(result), "decision": (
+            None if found.findings is None else account(found.findings, result.config.thresholds)),
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
@@ -365,6 +372,19 @@ def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
             "heterogeneity": {"q": agreement.q, "manoeuvres": int(agreement.asked.sum()), "p_value": agreement.p,
                               "scatter": agreement.scatter, "power": agreement.power, "outcome": agreement.outcome},
             "falsifiers": predictions_of(one.falsifiers) if one else []}
+
+
+def form_curves(result: Result) -> dict[str, list[dict[str, Any]]]:
+    """Effect -> curves of how far it is off its law (`sysid.verdict.forms.Deviation`). What its forms leave counts as
+    noise."""
+    found, form = result.search, result.config.thresholds.form
+    if found.verdict != "named" or found.findings is None:
+        return {}
+    final, variants = found.final, tuple(one.key for one in found.final.hypotheses)
+    left = min(one.bent.excess for one in found.findings.sets if one.variants == variants)
+    forms = forms_of(refitter_of(result), final, result.evidence.groups)
+    return {one.effect: [each.report() for each in forms.deviations(form, number, 1 + max(left, 0.0))]
+            for number, one in enumerate(final.hypotheses)}
 
 
 def detectable(result: Result, days: Days) -> list[dict[str, Any]]:

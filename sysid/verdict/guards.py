@@ -9,7 +9,7 @@ from sysid.missing.refit import Refitter
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsification import put_to_test
 from sysid.verdict.found import Search
-from sysid.verdict.posterior import Thresholds
+from sysid.verdict.posterior import Thresholds, contradicted
 from sysid.verdict.result import Support
 
 
@@ -30,14 +30,11 @@ def stand(
 
 def guarded(found: Search, stood: Sequence[Support], thresholds: Thresholds) -> Search:
     """The search without a name where one of its effects is contradicted."""
-    if found.findings is not None:
-        names = tuple(one.hypothesis.effect for one in found.accepted)
-        return found.judged(found.findings.put_to_test(names, [
-            each for one in stood for each in one.against(thresholds)]), thresholds)
     named = {one.hypothesis.effect for one in found.accepted}
     against = [each for one in stood if one.effect in named for each in one.against(thresholds)]
+    if found.findings is not None:
+        return found.judged(found.findings.put_to_test([one.hypothesis.effect for one in found.accepted], against),
+                            thresholds)
     if against:
-        found.verdict = "unexplained"
-        found.reason = (f"{' and '.join(sorted(named))} would explain {found.share:.0%} of what can be explained, but "
-                        f"{'; '.join(against)}")
+        found.verdict, found.reason = "unexplained", contradicted(named, found.share, against)
     return found

@@ -74,7 +74,6 @@ def yaw_rates(log: Log) -> Rates | None:
 
 def residuals(result: Result, values: np.ndarray) -> np.ndarray:
     """White residuals (N, B, n) of the binned drives with values (N, all)."""
-
     reference = result.reference
     drives, before = drives_of(result, result.log.training, reference.params)
     at = drives.simulate(before[None])[0]
@@ -85,8 +84,6 @@ def residuals(result: Result, values: np.ndarray) -> np.ndarray:
 
 def fitted(result: Result, delay: float) -> np.ndarray:
     """Values (all,) of the base model fitted to whole poses that are late by `delay` [s]."""
-
-
     names, reference = list(result.names), result.reference
     drives, values = drives_of(result, result.log.training, fitted_before(result))
     values = with_values(values, names, {PARAMETER: delay})

@@ -16,7 +16,7 @@ import numpy as np
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander
 from sysid.missing.evidence import RIDGE, Columns, Evidence, Solver
-from sysid.verdict.found import PairScan
+from sysid.verdict.found import PairScan, tail
 from sysid.verdict.scan import REACH, NullDays
 
 DRAWS = 300
@@ -24,7 +24,7 @@ DRAWS = 300
 TOGETHER = 256
 """Pairs of columns that are solved in one call."""
 CHI_SQUARED = 2.0
-"""Size over which the tail of chi-squared falls by e."""
+"""Worth over which the tail of chi-squared falls by e. That of a pair is no steeper: many are 0 on nearly all nulls."""
 
 
 class PairSolver:
@@ -66,17 +66,6 @@ def _ends(columns: Columns, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndar
     return low - 1e-9, np.array([axis.limit if axis.signed else REACH * columns.level for axis in hypothesis.axes])
 
 
-def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray:
-    """P(null >= value); beyond the upper tenth of the draws (N,) at most as steep as that of chi-squared, because the
-    worth of many pairs is 0 on nearly all of them."""
-    value, ordered = np.asarray(value, float), np.sort(null)
-    count = len(ordered)
-    p = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
-    top = ordered[int(0.9 * count) :]
-    far = 0.1 * np.exp(-(value - top[0]) / max(float(top.mean() - top[0]), CHI_SQUARED))
-    return np.asarray(np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), p))
-
-
 def scan_pairs(
     evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, nulls: NullDays, similar: np.ndarray,
     alike: float,
@@ -92,8 +81,8 @@ def scan_pairs(
     gain, worth, found, null = _looked(PairSolver(evidence, hypotheses, wander, nulls), hypotheses, members)
     p, smallest = np.ones(len(members)), np.ones(len(null))
     for m in range(len(members)):
-        p[m] = float(tail(null[:, m], worth[m]))
-        smallest = np.minimum(smallest, tail(null[:, m], null[:, m]))
+        p[m] = float(tail(null[:, m], worth[m], CHI_SQUARED))
+        smallest = np.minimum(smallest, tail(null[:, m], null[:, m], CHI_SQUARED))
     return PairScan(members, gain, worth, found, p, smallest, null)
 
 
@@ -101,7 +90,7 @@ def scan_again(first: PairScan, evidence: Evidence, hypotheses: Sequence[Hypothe
     """The same pairs on other drives of the same commands, held against the nulls of a scan made before."""
     nothing = NullDays(np.zeros((0, evidence.products.shape[1])), np.zeros((0, len(wander.shapes[0]))))
     gain, worth, found, _ = _looked(PairSolver(evidence, hypotheses, wander, nothing), hypotheses, first.members)
-    p = np.array([float(tail(first.null[:, m], worth[m])) for m in range(len(first.members))])
+    p = np.array([float(tail(first.null[:, m], worth[m], CHI_SQUARED)) for m in range(len(first.members))])
     return replace(first, gain=gain, worth=worth, q=found, p=p)
 
 

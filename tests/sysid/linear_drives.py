@@ -37,7 +37,7 @@ class Linear:
         self.evidence, self.precision = evidence, evidence.precision
         self.reference = SimpleNamespace(u=np.zeros(1), spread=SPREAD)
         self.drives = SimpleNamespace(mask=np.ones(evidence.residual.shape), repeats=np.arange(len(evidence.residual)),
-                                      simulate=self.simulate)
+                                      features=SimpleNamespace(width=0.25), simulate=self.simulate)
 
     def simulate(self, sets):
         """(N, B, K, 5) features with values (N, 5) of the base parameter and the four effects."""

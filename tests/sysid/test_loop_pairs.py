@@ -12,7 +12,8 @@ from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
-from sysid.verdict.pairs import scan_again, scan_pairs, tail
+from sysid.verdict.found import tail
+from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.rounds import begin
 from sysid.verdict.scan import null_days, run
@@ -106,8 +107,8 @@ def test_effects_that_wander_from_day_to_day_are_worth_less_together():
 
 def test_a_tail_of_zeros_is_no_steeper_than_that_of_chi_squared():
     null = np.concatenate([np.zeros(195), [1.0, 2.0, 3.0, 1.0, 2.0]])
-    assert tail(null, 4.0) > 0.01
-    assert tail(null, 0.0) == 1.0
+    assert tail(null, 4.0, CHI_SQUARED) > 0.01
+    assert tail(null, 0.0, CHI_SQUARED) == 1.0
 
 
 def test_the_other_effect_of_a_pair_may_come_last():
