@@ -180,11 +180,11 @@ def _first_points(
 def choose(
     objective: Objective, u: np.ndarray, track: float, config: FitConfig, stages: Stages | None = None
 ) -> DriveResiduals:
-    """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count what they
-    tell.
+    """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count the same
+    information.
 
     Where the errors of whole poses are those of their sensors alone, from sample to sample, least squares of them are
-    efficient. Disturbances add up along a drive: then their errors go together, and motion in bins tells more.
+    efficient. Disturbances add up along a drive: then their errors go together, and motion in bins determines more.
 
     Args:
         u: (P,) where the search begins, or where that on features ended; a few steps on poses lead on from there.
@@ -268,7 +268,7 @@ def _subject(
         model = wheel_model(log.spec)
     if model is not None:
         if config.vehicle is not None:
-            raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
+            raise ValueError(f"{config.vehicle}: a vehicle file says nothing of the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
         alone: tuple[str, ...] = ()
         model = model.with_effects((*config.effects, *gyro_effects(trials)))
