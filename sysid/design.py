@@ -27,6 +27,7 @@ from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
 from whill_mjx.io.folders import check_place
+from whill_mjx.io.heartbeat import Heartbeat
 from whill_mjx.vehicle.parameters import describe
 
 
@@ -78,8 +79,10 @@ def main(config: DesignConfig) -> list[Path]:
             min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
             float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
             config.seconds)
-        found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
-                        names=config.parameters or None)
+        with Heartbeat() as heartbeat:
+            heartbeat.stage("simulating the manoeuvres of the library: half a minute, most of it compilation")
+            found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
+                            names=config.parameters or None)
     paths = []
     for number, plan in enumerate(found.chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
@@ -87,7 +90,7 @@ def main(config: DesignConfig) -> list[Path]:
         write_csv(path, COMMAND_HEADER, command.table)
         paths.append(path)
     print(text(found, config.criterion))
-    paths.append(write_page(config.out.with_suffix(".html"), found, limits, config))
+    paths.append(write_page(config.out.with_suffix(".html"), found, limits, config, describe(subject.params)))
     for path in paths:
         print(f"wrote {path}")
     return paths

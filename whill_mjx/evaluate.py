@@ -187,8 +187,10 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
     if options.html:
         from whill_mjx.evaluation.pages import page
 
-        say(f"report: {page(evaluation, pictures, videos, options.out / 'report.html')}")
-    say(f"{options.out / 'evaluation.json'}: {evaluation['seconds']:.0f} s")
+        say(f"open {page(evaluation, pictures, videos, options.out / 'report.html')} in a browser")
+    files = ", ".join(["evaluation.json", *(one.name for one in (*pictures, *videos))])
+    say(f"wrote {files} in {options.out}; {evaluation['seconds']:.0f} s"
+        + ("" if options.html else ". With --html you get one page with everything."))
     return evaluation
 
 

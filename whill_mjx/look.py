@@ -30,6 +30,7 @@ from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import PlannerConfig, first_plan, for_task, plan_action
 from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun, step_with_terms
 from whill_mjx.io.folders import check_place, whole_file, write_whole
+from whill_mjx.io.heartbeat import Heartbeat
 from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
@@ -277,10 +278,12 @@ def main(options: Look) -> None:
         write_video(options.out, frames, options.scale)
         print(f"{options.out}: {len(frames)} frames of {options.scene}")
         return
-    if options.scene == "gallery":
-        sheet = gallery_sheet()
-    else:
-        sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
+    with Heartbeat() as heartbeat:
+        heartbeat.stage(f"drawing {options.scene}: half a minute, most of it compilation")
+        if options.scene == "gallery":
+            sheet = gallery_sheet()
+        else:
+            sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
     write_png(options.out, sheet.repeat(options.scale, 0).repeat(options.scale, 1))
     print(f"{options.out}: {options.scene}")
 

@@ -125,6 +125,9 @@ CLAIMS = (
                 "{rmse_chair_fitted}",
                 "{rmse_chair_ideal}",
             ),
+            ("the same, all sizes kept as stated", "{chair_replicate_ratio_as_stated}", "-", "-"),
+            ("the same, all sizes free", "{chair_replicate_ratio_all_free}", "-", "-"),
+            ("contact plant, all sizes as stated", "{plant_replicate_ratio_physical_as_stated}", "-", "-"),
         ),
     ),
     Claim(

@@ -14,6 +14,7 @@ from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import Experiment, make_log
 from bridge.options import Parser, in_range, whole
 from whill_mjx.io.command_line import OptionError, guarded
+from whill_mjx.io.heartbeat import Heartbeat
 
 
 def main(arguments: list[str] | None = None) -> Path:
@@ -44,7 +45,9 @@ def main(arguments: list[str] | None = None) -> Path:
     experiment = Experiment(
         effects, given.seed, given.noise, not given.nominal, given.manoeuvres, given.replicates, given.vehicle
     )
-    return make_log(given.out, experiment, not given.no_ground_truth, given.answers, given.processes)
+    with Heartbeat() as heartbeat:
+        heartbeat.stage("driving the manoeuvres on the contact plant")
+        return make_log(given.out, experiment, not given.no_ground_truth, given.answers, given.processes)
 
 
 if __name__ == "__main__":

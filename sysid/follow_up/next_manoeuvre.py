@@ -86,8 +86,8 @@ def next_manoeuvre(result: Result) -> dict[str, Any] | None:
         `name`, `parameters` {v [m/s], omega [rad/s], seconds, dt [s]} and `start` {x, y [m], heading [rad]} of the
         drive, `splits` (the effects that it separates), `expected_separation` (standard deviations, the worst pair of
         these, one drive), `replicates` (drives after which that is `ENOUGH`), `file`, and `not_split`: pairs of effects
-        that no drive separates, with the best `separation` and the `sensor` that would. Where no drive
-        separates any, name, parameters, start and file are None.
+        that no drive separates, with the best `separation` and the `sensor` that would. Where no drive separates
+        any of them, name, parameters, start and file are None.
     """
     rounds = rivals_of(result)
     if not rounds:

@@ -45,7 +45,8 @@ def make_report(data: Loaded, config: FitConfig, fit: Fit, rows: list[dict[str, 
     log = data.log
     about = describe_parameters(fit.params)
     parameters = [
-        {"name": one.name, "unit": about[one.name].unit, "initial": one.initial, "value": one.value,
+        {"name": one.name, "meaning": about[one.name].description, "unit": about[one.name].unit,
+         "initial": one.initial, "value": one.value,
          "interval": [one.low, one.high], "confidence": uncertainty.CONFIDENCE,
          "bounds": [float(fit.space.low[i]), float(fit.space.high[i])], "identifiable": one.identifiable,
          "remark": one.remark}

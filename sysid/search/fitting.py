@@ -180,11 +180,10 @@ def _first_points(
 def choose(
     objective: Objective, u: np.ndarray, track: float, config: FitConfig, stages: Stages | None = None
 ) -> DriveResiduals:
-    """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count the same
-    information.
+    """Choose the last objective of a search, whole poses or motion in bins, with the weight of its prior.
 
-    Where the errors of whole poses are those of their sensors alone, from sample to sample, least squares of them are
-    efficient. Disturbances add up along a drive: then their errors go together, and motion in bins determines more.
+    Least squares of whole poses are efficient where only the sensors err, independently in each sample. Disturbances
+    add up along a drive, so the errors of poses are correlated: motion in bins then holds more information.
 
     Args:
         u: (P,) where the search begins, or where that on features ended; a few steps on poses lead on from there.
@@ -268,7 +267,7 @@ def _subject(
         model = wheel_model(log.spec)
     if model is not None:
         if config.vehicle is not None:
-            raise ValueError(f"{config.vehicle}: a vehicle file says nothing of the model {model.name!r}. Leave "
+            raise ValueError(f"{config.vehicle}: a vehicle file says nothing about the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
         alone: tuple[str, ...] = ()
         model = model.with_effects((*config.effects, *gyro_effects(trials)))

@@ -69,7 +69,7 @@ def _scale_bar(axes: Any, metres: float = 1.0) -> None:
     """Draw a bar of this length in the lower left corner."""
     x, y = axes.get_xlim()[0] + 0.15, axes.get_ylim()[0] + 0.15
     axes.plot([x, x + metres], [y, y], "-", color="black", linewidth=2, solid_capstyle="butt")
-    axes.text(x + metres / 2, y + 0.08, f"{metres:g} m", ha="center", va="bottom", fontsize=6)
+    axes.text(x + metres + 0.08, y, f"{metres:g} m", va="center", fontsize=6)
 
 
 def _legend(figure: Any, endings: set[str], columns: int) -> None:
@@ -81,7 +81,7 @@ def _legend(figure: Any, endings: set[str], columns: int) -> None:
                           for how, colour in ENDINGS.items() if how in endings]  # fmt: skip
     handles += [
         Line2D([], [], color="grey", marker="o", linestyle="", markersize=4,
-               label="end of the drive axle; the body is longer"),
+               label="last position of the drive axle; the body reaches further"),
         Line2D([], [], color="tab:blue", marker="s", linestyle=":", markersize=4, label="goal and its region"),
         Patch(color="grey", label="boxes and walls, in their colours"),
     ]
