@@ -4,8 +4,9 @@ Wheels stick or slip, torques meet their limit and delays act in steps: the floo
 depend on how far they look. Differences over a fixed share of each parameter's range (`sysid.replay.differences`)
 lead there from afar, but one at a time, over many times what a delay errs by and hardly what a sag does: on the floor a
 search by them stops at one of many folds, and they determine some parameters half, others twice as well as the log
-does. What counts is how residuals differ over all likely values: a plane through them at points drawn from the ellipsoid of the
-errors has those slopes (statistical linearisation; Gelb, 1974, chapter 6), and the ellipsoid comes from the slopes.
+does. What counts is how residuals differ over all likely values: a plane through them at points drawn from the
+ellipsoid of the errors has those slopes (statistical linearisation; Gelb, 1974, chapter 6), and the ellipsoid comes
+from the slopes.
 """
 
 from __future__ import annotations
