@@ -295,7 +295,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         "of --vehicle")
     parser.add_argument("--wheels", nargs="+", metavar="NAME",
                         help="of --robot: joints or actuators of its driven wheels, left and right")
-    parser.add_argument("--episodes", type=whole(0), default=0, help="end after so many; 0: never")
+    parser.add_argument("--episodes", type=whole(0), default=0, help="end after this many episodes; 0: never")
     parser.add_argument("--seed", type=whole(0), default=0, help="of the first episode; each next one adds 1")
     parser.add_argument("--wait", type=in_range(0), default=10.0,
                         help="wait so long for a driver before the first one [s]")

@@ -16,7 +16,7 @@ STANDING = (0.01, 0.02)
 class SplitWriter:
     """Takes what a `TrialWriter` takes, and makes a trial of each drive.
 
-    A trial begins so many seconds before the first motion, and ends when the vehicle has stood for as long. What comes
+    A trial begins some seconds before the first motion, and ends when the vehicle has stood for as long. What comes
     while it stands longer is dropped.
     """
 

@@ -27,7 +27,6 @@ from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
 from whill_mjx.io.folders import check_place
-from whill_mjx.io.heartbeat import Heartbeat
 from whill_mjx.vehicle.parameters import describe
 
 
@@ -79,10 +78,9 @@ def main(config: DesignConfig) -> list[Path]:
             min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
             float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
             config.seconds)
-        with Heartbeat() as heartbeat:
-            heartbeat.stage("simulating the manoeuvres of the library: half a minute, most of it compilation")
-            found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
-                            names=config.parameters or None)
+        command_line.stage("simulating the manoeuvres of the library: half a minute, most of it compilation")
+        found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
+                        names=config.parameters or None)
     paths = []
     for number, plan in enumerate(found.chosen, start=1):
         path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")

@@ -108,7 +108,7 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
         vehicle = replace(vehicle, kept=not references)
     kept = vehicle is not None and vehicle.kept
     progress, close = command_line.progress_bar(
-        expected_steps(config, len(days_of(references)), kept), "close the loop", "step")
+        expected_steps(config, len(days_of(references)), kept), "close the loop")
     progress(0, "reference vehicle")
     try:
         return find_missing(log, references, config, vehicle, progress)
