@@ -31,8 +31,8 @@ REACH = 0.08
 EXACT = 1e-9
 """Least cost, in squared noise scales: a model that fits to the last bit still has an ellipsoid."""
 ROUNDS, MISSES, WORTH = 24, 3, 2e-4
-"""Maximum rounds of a descent; patience; and the share of the cost that a round must gain to count, unless it lowers the
-sum of squares by one. With stricter limits estimates would move by a small share of their errors."""
+"""Maximum rounds of a descent; patience; and the share of the cost that a round must gain to count, unless it lowers
+the sum of squares by one. With stricter limits estimates would move by a small share of their errors."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
 SIZES = (1.0, 0.3)
 """Of the ellipsoid, in turn: its own size, and one within which the parameters that move little act linearly."""

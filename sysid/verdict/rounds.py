@@ -20,7 +20,11 @@ from sysid.verdict.found import EFFORT, Candidate, PairScan, Scan, Search
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.scan import best, run
 
-FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
+FIRST_LOOK, POLISH, TO_ITS_END = 4, 8, 60
+"""Iterations at most of a refit for every candidate, of one that starts again, and of what is compared or built on.
+
+Fits end by themselves long before the last number where the base lies near the reference. Of drives that stand alone
+the base may go far: cut short, the next effect would be credited with what the fit before it had not yet found."""
 ELSEWHERE = (1.0, 3.0)
 """Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
 SIDE = 2.0
@@ -80,7 +84,7 @@ def begin(
         if progress is not None:
             progress(1, text)
 
-    base = refitter.fit((), np.zeros(0))
+    base = refitter.fit((), np.zeros(0), TO_ITS_END)
     report("base refit")
     far = best(Solver(evidence), hypotheses, wander)
     evidence = at_fit(evidence, base.residual, base.jacobian, base.u - refitter.reference.u)
@@ -113,11 +117,13 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
     asked.report(f"refits, round {number}")
     least = current.cost - asked.thresholds.form * max((current.cost - fit.cost for fit in fits), default=0.0)
     best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
-    for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
+    for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], TO_ITS_END), strict=True):
         fits[i] = fit
     for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
-        again = refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
-        fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
+        again = min(refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH),
+                    key=lambda fit: fit.cost)
+        if again.cost < fits[i].cost:
+            [fits[i]] = refitter.fit_all([Start.at(again)], TO_ITS_END)
     asked.report(f"polish, round {number}")
     similar = np.where(asked.similar > asked.thresholds.form, asked.similar, 0.0)
     rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken)

@@ -52,7 +52,7 @@ class Linear:
         values[[1 + EFFECTS.index(one) for one in chosen]] = q
         return values
 
-    def fit(self, chosen, _):
+    def fit(self, chosen, *_):
         columns = self.evidence.design[..., [0, *(1 + EFFECTS.index(one) for one in chosen)]]
         flat = columns.reshape(-1, columns.shape[-1])
         matrix = flat.T @ flat

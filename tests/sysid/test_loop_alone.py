@@ -14,6 +14,7 @@ from sysid.errors.features import BIN, bin_width, make_features
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import no_wander
+from sysid.missing.joint_fit import Start as JointStart
 from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import Commanded, make_batch, path_of
 from sysid.verdict import alone
@@ -87,6 +88,35 @@ def test_effects_are_added_as_long_as_they_predict_blocks_that_were_held_back():
     assert named(found) == ("named", ["side_force", "command_scale"])
     assert [one.hypothesis.effect for one in found.rounds[1]][0] == "command_scale" and len(found.rounds) == 3
     assert UNTOLD in found.reason and found.excess[1] < found.excess[0]
+
+
+class Slow(Linear):
+    """Fits that go a tenth of what is left of the way in each iteration."""
+
+    def fit(self, chosen, q, iterations=12):
+        return self.fit_all([JointStart(tuple(chosen), self.reference.u, q)], iterations)[0]
+
+    def fit_all(self, starts, iterations):
+        return [self.on_the_way(start, 0.9**iterations) for start in starts]
+
+    def on_the_way(self, start, left):
+        end, size = super().fit(start.hypotheses, None), len(start.u)
+        at = np.concatenate([end.u, end.q])
+        away = left * (np.concatenate([start.u, start.q]) - at)
+        residual = end.residual - end.jacobian @ away
+        return replace(end, u=(at + away)[:size], q=(at + away)[size:], cost=float(np.square(residual).sum()),
+                       residual=residual)
+
+
+def test_no_effect_is_credited_with_what_the_fit_before_it_had_not_found_yet():
+    evidence = drives((0.0, 0.0, 2.0, 0.0))
+    asked = begin(evidence, EFFECTS, Slow(evidence), no_wander(evidence.columns), Thresholds(), draws=300)
+    small = replace(asked.scan, q=tuple(0.1 * q for q in asked.scan.q))  # a linear scan may be far off
+    found = search_alone(replace(asked, far=None, scan=small))
+    exact = verdict((0.0, 0.0, 2.0, 0.0))
+    assert named(found) == named(exact) == ("named", ["side_force"])
+    assert found.accepted[0].gain == pytest.approx(exact.accepted[0].gain, rel=1e-3)
+    assert max(one.gain for one in found.rounds[1]) < 10  # chance
 
 
 def test_what_every_block_asks_another_size_of_is_not_named():
