@@ -62,13 +62,11 @@ def find_missing(
     evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
     gathered = time.perf_counter()
     refitter = Refitter(drives, ready.reference, ready.values, slopes)
-    draws = min(config.draws, 300) if config.quick else config.draws
 
     def anything(residual: np.ndarray) -> float:
         return best_gain(log.training, log.spec, residual, ready.reference.width, ready.reference.channels)
 
-    asked = begin(evidence, ready.hypotheses, refitter, ready.wander, config.thresholds, anything, draws, config.seed,
-                  progress)
+    asked = begin(evidence, ready, refitter, config, anything, progress)
     alone = stands_alone(log.training, ready.reference.known)
     judge: Callable[[Asked, PairScan | None], Search] = settle
     if alone:

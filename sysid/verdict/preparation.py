@@ -65,8 +65,7 @@ def _plant(spec: VehicleSpec, config: LoopConfig) -> Plant:
 
 def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     """How far the progress bar goes at most, with so many reference days."""
-    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
-    base = 0 if fitted else iterations + max(iterations // 2, 3)
+    base = 0 if fitted else config.base_iterations + max(config.base_iterations // 2, 3)
     return base + 6 * days + 2 * PARTS + 4 + 3 * (2 * EFFORT.rounds + 1) + config.refit_nulls
 
 
@@ -105,6 +104,5 @@ def reference_for(
     start = preset_params(log.spec, config.preset) if fitted is None else fitted.params
     start = with_effects(start, (*config.with_effects, *gyro_effects(
         [trial for one in references or (log,) for trial in one.training])))
-    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
     return make_reference(FreeVehicle(plant, start, tuple(_free(start, config))), days_of(references) or (log,),
-                          bool(references), iterations, progress)
+                          bool(references), config.base_iterations, progress)

@@ -83,6 +83,16 @@ class LoopConfig:
     thresholds: Thresholds = field(default_factory=Thresholds)
     """When something counts as found."""
 
+    @property
+    def nulls(self) -> int:
+        """Simulated nulls, fewer where it must be quick."""
+        return min(self.draws, 300) if self.quick else self.draws
+
+    @property
+    def base_iterations(self) -> int:
+        """Iterations of the base fit, fewer where it must be quick."""
+        return max(self.iterations // 2, 4) if self.quick else self.iterations
+
 
 @dataclass(frozen=True)
 class Prepared:

@@ -14,7 +14,7 @@ from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
 from sysid.verdict.found import tail
 from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
-from sysid.verdict.posterior import Thresholds
+from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import begin
 from sysid.verdict.scan import null_days, run
 from sysid.verdict.search import pairs_of as pairs_of_effects
@@ -63,7 +63,7 @@ def test_pairs_of_nothing_have_no_small_p_values(wander):
 
 
 def verdict(evidence, wander):
-    asked = begin(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), draws=300)
+    asked = begin(evidence, SimpleNamespace(hypotheses=EFFECTS, wander=wander), Linear(evidence), LoopConfig(draws=300))
     return settle(asked, pairs_of_effects(asked))
 
 
