@@ -135,7 +135,6 @@ def make_report(result: Result) -> dict[str, Any]:
     vehicle = f"the vehicle of {', '.join(about)}" if about else "the vehicle file"
     asked = (f"what has changed or is missing against {vehicle}"
              if result.reference.known else "what the model family lacks")
-    nulls = result.null_refits
     noise = {} if result.noise is None else result.noise.report()
     base = base_table(result)
     same = found.verdict == "none" and not shifts(base) and not (result.floor and result.floor.named)
@@ -157,13 +156,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
         "log_doubts": doubts(result.log), "contradicted": contradicted(result), "pairs": pairs_of(result),
-        "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
-                    "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
-                    "excess_before": found.excess[0],
-                    "excess_after": found.excess[1], "explained": found.share,
-                    "null_refits": None if nulls is None else {
-                        "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
-                        "upper": nulls.upper}},
+        "missing": missing(result),
         "weights": found.weights, "steps": steps(result),
         "forms": form_curves(result), "decision": (
             None if found.findings is None else account(found.findings, result.config.thresholds)),
@@ -268,6 +261,17 @@ def operating(result: Result, days: Days) -> dict[str, Any]:
                 power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
     return {"alpha": alpha, "decisions": EFFORT.rounds + 2, "days": "simulated, linear",
             "false_alarms": false_alarms(days, alpha), "power": power}
+
+
+def missing(result: Result) -> dict[str, Any]:
+    """p-values of "nothing is missing", and what exceeds the noise."""
+    found, nulls = result.search, result.null_refits
+    return {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
+            "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
+            "excess_before": found.excess[0], "excess_after": found.excess[1], "explained": found.share,
+            "null_refits": None if nulls is None else {
+                "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
+                "upper": nulls.upper}}
 
 
 def steps(result: Result) -> list[dict[str, Any]]:

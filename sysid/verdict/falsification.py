@@ -56,7 +56,10 @@ def put_to_test(
             law = Law(one.effect, falsifier, ALPHA / len(tested))
             if falsifier.kind == "absent":
                 quiet = QUIET[falsifier.by](course)[..., None] & seen
-                out[-1].append(_absent(law, fit, number, refitter.precision, quiet, p_excess))
+                part = fit.parts[number]
+                gains = (_gain(moved_last(fit, number), part.stop - part.start, refitter.precision),
+                         _gain(fit, len(fit.q), refitter.precision))
+                out[-1].append(_absent(law, fit.residual.reshape(quiet.shape)[quiet], gains, p_excess))
                 continue
             sides = SPLITS[falsifier.by](course, energy)
             parts = np.stack([change * (sides == which)[..., None] for which in (-1.0, 1.0, 0.0)], axis=-1)
@@ -110,18 +113,17 @@ def _same(law: Law, size: np.ndarray, covariance: np.ndarray, freedom: int) -> T
 
 
 def _absent(
-    law: Law, fit: Refit, number: int, precision: np.ndarray, quiet: np.ndarray, p_excess: Callable[[float], float]
+    law: Law, residual: np.ndarray, gains: tuple[float, float], p_excess: Callable[[float], float]
 ) -> Tested:
-    """Whether what is left in bins (B, K, C) where an effect does nothing is too much for it to be what is missing."""
-    count = float(quiet.sum())
-    left = float(np.square(fit.residual.reshape(quiet.shape)[quiet]).sum()) - count
-    part = fit.parts[number]
-    gain = _gain(moved_last(fit, number), part.stop - part.start, precision)
-    p = float(p_excess(left / count)) if count else 1.0
-    share = left / _gain(fit, len(fit.q), precision)
-    visible = count > 0 and p_excess(gain / count) < law.alpha  # had it all been left there, it would have been seen
+    """Whether the residual (N,) where an effect does nothing is too large for it to be what is missing; `gains` has by
+    how much it alone and all effects lower the cost."""
+    count = float(len(residual))
+    left = float(np.square(residual).sum()) - count
+    own, every = gains
+    p, share = float(p_excess(left / count)) if count else 1.0, left / every
+    visible = count > 0 and p_excess(own / count) < law.alpha  # had it all been left there, it would have been seen
     outcome = "falsified" if p < law.alpha and share > LEFT else "holds" if visible else "untold"
-    return Tested(law.effect, law.falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
+    return Tested(law.effect, law.falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / own), p,
                   1.0 if visible else 0.0)
 
 

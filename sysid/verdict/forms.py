@@ -66,6 +66,7 @@ class Forms:
     shape: tuple[int, ...]  # (B, n / B) of the residual
     units: tuple[float, ...]
     """Per effect: factor on its modulations that makes them together as large as it is."""
+    centres: tuple[np.ndarray, ...]  # per effect (7,): means of the modulations by `QUANTITIES`, where it acts
     motion: Motion
 
     def left(self, form: float) -> np.ndarray:
@@ -98,7 +99,7 @@ class Forms:
         return max(costs[0] - costs[1], 0.0), apart[0] - apart[1]
 
     def deviations(self, form: float, number: int, noise: float = 1.0) -> list[Deviation]:
-        """How far one of the effects is off the catalogue's law over speed, yaw rate and time.
+        """How far one of the effects is off the catalogue's law over speed, yaw rate and time, of its mean size.
 
         Args:
             noise: variance of the white residual.
@@ -106,12 +107,14 @@ class Forms:
         columns, before = [self.base, *self.sizes], sum(one.shape[1] for one in self.bent[:number])
         solution, design = self._solved(columns, self.bent, form, self.target)
         covariance = _solve(design.T @ design + self._prior(columns, self.bent, form), np.eye(design.shape[1])) * noise
-        first, out = sum(one.shape[1] for one in columns) + before, []
+        start = first = sum(one.shape[1] for one in columns) + before
+        out = []
         for (name, unit), (low, high), scale, middle in zip(
                 QUANTITIES, self.motion.ends, self.motion.scale, self.motion.middle, strict=True):
             at = np.linspace(low, high, POINTS)
-            basis = self.units[number] * shapes((at - middle) / scale, name)
+            basis = shapes((at - middle) / scale, name)
             index = slice(first, first + basis.shape[-1])
+            basis = self.units[number] * (basis - self.centres[number][first - start : index.stop - start])
             error = np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance[index, index], basis))
             out.append(Deviation(name, unit, at, basis @ solution[index], error))
             first = index.stop
@@ -154,13 +157,15 @@ def forms_of(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]]) -> 
     bent = [refitter.white(modulated(whole - one, whole, groups)) for one in less]
     units = [float((np.square(change).sum() / max(np.square(one).sum(), 1e-12)) ** 0.5)
              for one, change in zip(bent, changes, strict=True)]
+    energy = [np.square(change).reshape(whole.shape).sum(-1) for change in changes]  # (B, K)
+    centres = [np.einsum("bk,bkm->m", one, factors_of(whole)) / max(float(one.sum()), 1e-12) for one in energy]
     size, count = len(fit.u), fit.residual.size
     columns = fit.jacobian.reshape(count, -1)
     target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u)
     return Forms(target, columns[:, :size], tuple(columns[:, size + one.start : size + one.stop] for one in fit.parts),
                  tuple(one.reshape(-1) for one in changes),
                  tuple(unit * one.reshape(count, -1) for unit, one in zip(units, bent, strict=True)),
-                 refitter.precision, fit.residual.shape, tuple(units), motion)
+                 refitter.precision, fit.residual.shape, tuple(units), tuple(centres), motion)
 
 
 def motion_of(features: np.ndarray, width: float = 1.0) -> Motion:
@@ -178,14 +183,20 @@ def shapes(x: np.ndarray, quantity: str) -> np.ndarray:
     return np.stack([np.clip(one, -MOST, MOST) for one in parts], -1)
 
 
+def factors_of(features: np.ndarray) -> np.ndarray:
+    """(B, K, 7) functions of `QUANTITIES` in drives with these features (B, K, C)."""
+    v, omega = np.moveaxis(features[..., :2] / motion_of(features).scale[:2], -1, 0)
+    time = np.broadcast_to(np.linspace(-1.0, 1.0, v.shape[1]), v.shape)
+    return np.concatenate([shapes(one, name) for one, (name, _) in zip((v, omega, time), QUANTITIES, strict=True)], -1)
+
+
 def modulated(change: np.ndarray, features: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:
     """What an effect changes, `change` (B, K, C), in other forms (B, K, C, m): in proportion to functions of `features`
     (B, K, C) and of time, of a size of its own in each manoeuvre, and shifted in time."""
-    v, omega = np.moveaxis(features[..., :2] / motion_of(features).scale[:2], -1, 0)
-    time = np.broadcast_to(np.linspace(-1.0, 1.0, v.shape[1]), v.shape)
-    factors = [shapes(one, name) for one, (name, _) in zip((v, omega, time), QUANTITIES, strict=True)]
-    factors += [np.isin(np.arange(len(v)), group)[:, None, None] * np.ones((*v.shape, 1)) for group in groups]
+    manoeuvres = [np.isin(np.arange(len(change)), group)[:, None, None] * np.ones((*change.shape[:2], 1))
+                  for group in groups]
     early, late = np.zeros_like(change), np.zeros_like(change)
     early[:, :-1], late[:, 1:] = change[:, 1:], change[:, :-1]
     shifted = np.stack([(early - late) / 2, early + late - 2 * change], -1)
-    return np.concatenate([change[..., None] * np.concatenate(factors, -1)[:, :, None], shifted], -1)
+    factors = np.concatenate([factors_of(features), *manoeuvres], -1)[:, :, None]
+    return np.concatenate([change[..., None] * factors, shifted], -1)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from sysid import command_line
+from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER
-from sysid.missing.days import Reference
+from sysid.missing.days import Reference, Wander
+from sysid.missing.evidence import Evidence
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
@@ -50,54 +52,74 @@ def find_missing(
     check_logs(log, references)
     if log.fields.get("pose_stamps") == "receipt":
         config = replace(config, pose_delay=True)
-    alpha, began = config.thresholds.alpha, time.perf_counter()
+    began = time.perf_counter()
     if reference is None:
         reference = reference_for(log, references, config, vehicle, progress)
-    usual = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
-    usual = usual.without(config.without)
+    ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
     fitted = time.perf_counter()
-    drives, at = usual.drives(log.training, log.spec.track)
-    noise = compared(drives, at, usual.reference, alpha)
-    ready = with_noise(usual, noise)
-    evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
+    seen = _look(log, ready.without(config.without), config, progress)
     gathered = time.perf_counter()
-    refitter = Refitter(drives, ready.reference, ready.values, slopes)
-
-    def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual, ready.reference.width, ready.reference.channels)
-
-    asked = begin(evidence, ready, refitter, config, anything, progress)
-    alone = stands_alone(log.training, ready.reference.known)
+    asked, reference = _asked(log, seen, config, progress), seen.ready.reference
+    alone = stands_alone(log.training, reference.known)
     judge: Callable[[Asked, PairScan | None], Search] = settle
     if alone:
         judge = partial(search_alone, wheels=any(trial.odometry is not None for trial in log.training))
     pairs = None if alone else pairs_of(asked, config.seed)
     outcome = judge(asked, pairs)
-    if outcome.findings is not None and noise is not None:
-        other = tuple(name for name, one in noise.report().items() if one["changed"])
+    if outcome.findings is not None and seen.noise is not None:
+        other = tuple(name for name, one in seen.noise.report().items() if one["changed"])
         outcome = outcome.judged(replace(outcome.findings, noise=other), config.thresholds)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(replace(asked, wander=usual.wander), judge, pairs, config.refit_nulls,
-                                config.seed, progress)
-        outcome = checked(outcome, nulls, ready.wander, config.thresholds)
-    # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
-    outcome, stood = _stood(outcome, asked, log, (lambda _: 1.0) if alone else usual.wander.p_excess)
+        usual = replace(asked, wander=seen.usual)
+        nulls = run_null_refits(usual, judge, pairs, config.refit_nulls, config.seed, progress)
+        outcome = checked(outcome, nulls, seen.ready.wander, config.thresholds)
+    stood: tuple[Support, ...] = ()
+    if outcome.verdict == "named":
+        # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
+        p_excess = (lambda _: 1.0) if alone else seen.usual.p_excess
+        stood = tuple(stand(outcome, seen.refitter, log.training, seen.evidence.groups, log.spec.track, p_excess))
+        outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise,
-                    floor_change(ready.reference, log.training, alpha))
-    late = alone and config.pose_delay and PARAMETER not in (*ready.reference.space.names, *config.held)
-    return told_late(result, alpha) if late else result
+    floor = floor_change(reference, log.training, config.thresholds.alpha)
+    result = Result(log, tuple(references), config, seen.ready, outcome, seen.evidence, seconds, nulls, stood,
+                    seen.noise, floor)
+    if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
+        result = told_late(result, config.thresholds.alpha)
+    return result
 
 
-def _stood(outcome: Search, asked: Asked, log: Log, p_excess: Callable[[float], float]
-           ) -> tuple[Search, tuple[Support, ...]]:
-    """The verdict after what a name must stand, and that; `p_excess` as of `stand`."""
-    if outcome.verdict != "named":
-        return outcome, ()
-    stood = tuple(stand(outcome, asked.refitter, log.training, asked.evidence.groups, log.spec.track, p_excess))
-    return guarded(outcome, stood, asked.thresholds), stood
+@dataclass(frozen=True)
+class Seen:
+    """What some drives show, before anything is searched for in them."""
+
+    ready: Prepared
+    """Where their noise is another one, with that noise."""
+    usual: Wander
+    """At the noise of the reference days."""
+    noise: NoiseLevels | None
+    evidence: Evidence
+    refitter: Refitter
+
+
+def _look(log: Log, ready: Prepared, config: LoopConfig, progress: Progress | None) -> Seen:
+    """Noise and signatures of the training trials."""
+    drives, at = ready.drives(log.training, log.spec.track)
+    noise = compared(drives, at, ready.reference, config.thresholds.alpha)
+    usual, ready = ready.wander, with_noise(ready, noise)
+    evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
+    return Seen(ready, usual, noise, evidence, Refitter(drives, ready.reference, ready.values, slopes))
+
+
+def _asked(log: Log, seen: Seen, config: LoopConfig, progress: Progress | None) -> Asked:
+    """What is searched for in the drives."""
+    reference = seen.ready.reference
+
+    def anything(residual: np.ndarray) -> float:
+        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
+
+    return begin(seen.evidence, seen.ready, seen.refitter, config, anything, progress)
 
 
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:

@@ -357,10 +357,10 @@ def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
 def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr("sysid.verdict.pipeline.find_missing",
-                        lambda *given, start: asked.append((*given, start)) or sloping)
+                        lambda *given: asked.append(given) or sloping)
     report = main(Arguments(dataset=folder / "sloping", reference=(folder / "reference_1",), out=tmp_path / "run"))
-    [(log, references, config, vehicle, _, start)] = asked
-    assert (log.name, [one.name for one in references], vehicle, start) == ("sloping", ["reference_1"], None, None)
+    [(log, references, config, vehicle, _)] = asked
+    assert (log.name, [one.name for one in references], vehicle) == ("sloping", ["reference_1"], None)
     assert config.seed == 0
     assert json.loads((tmp_path / "run/report.json").read_text())["verdict"] == report["verdict"] == "named"
     assert "verdict: named" in capsys.readouterr().out
@@ -369,8 +369,8 @@ def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, caps
     assert "something unknown" in (tmp_path / "run/report.html").read_text()
     main(Arguments(dataset=folder / "sloping", reference=(folder / "plain",), vehicle=tmp_path / "run/vehicle.toml",
                    out=tmp_path / "again"))
-    *_, vehicle, _, start = asked[-1]
-    assert vehicle is None and set(describe(start)) >= set(describe(sloping.reference.params))
+    *_, vehicle, _ = asked[-1]
+    assert not vehicle.kept and set(describe(vehicle.params)) >= set(describe(sloping.reference.params))
 
 
 def test_refit_to_poses_lowers_the_training_error(drives, sloping):

@@ -83,8 +83,8 @@ def test_the_curve_of_a_form_shows_over_which_quantity_an_effect_is_larger_than_
     fit = model.fit(1)
     speed, turning, time = forms_of(model, fit, GROUPS).deviations(0.5, 0)
     assert [one.quantity for one in (speed, turning, time)] == ["speed", "yaw rate", "time in the drive"]
-    planted = 3.0 * 0.5 * np.abs(speed.at) / fit.q[0]
-    assert np.mean(np.abs(speed.share - planted) < 2 * speed.error) > 0.9 and speed.share.max() > 5 * speed.error.max()
+    planted = 3.0 * (1 + 0.5 * np.abs(speed.at)) / fit.q[0] - 1  # off the size that is found on average
+    assert np.mean(np.abs(speed.share - planted) < 2 * speed.error) > 0.8 and speed.share.max() > 5 * speed.error.max()
     for one in (turning, time):  # it does not depend on these
         assert np.abs(one.share / np.maximum(one.error, 1e-9)).max() < 3
     assert time.at[[0, -1]].tolist() == [0.0, BINS * 0.25]
