@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.follow_up.tables import (
+from sysid.follow_up.wrench_tables import (
     Products,
     WrenchTable,
     few_terms,
@@ -26,7 +26,7 @@ from sysid.follow_up.tables import (
     penalties,
     turned,
 )
-from sysid.follow_up.terms import Term, columns_of, in_words
+from sysid.follow_up.wrench_terms import Term, columns_of, in_words
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS

@@ -12,9 +12,9 @@ from sysid.errors.features import CHANNELS, make_features
 from sysid.errors.noise import deviations, replicate_groups
 from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
-from sysid.follow_up.tables import WrenchTable
 from sysid.follow_up.trust import advice, as_good_as_repeats, beside_still_base, warnings
 from sysid.follow_up.unnamed import vehicle_of, with_start_angles
+from sysid.follow_up.wrench_tables import WrenchTable
 from sysid.logs.log import load_log
 from sysid.logs.metrics import own_floor, score
 from sysid.logs.synthetic import Schedule, write_dataset

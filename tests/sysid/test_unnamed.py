@@ -9,9 +9,9 @@ import pytest
 from sysid.errors.features import BIN
 from sysid.errors.noise import Whitener
 from sysid.errors.space import make_space
-from sysid.follow_up.tables import Products, WrenchTable, few_terms, gains_without, shift
-from sysid.follow_up.terms import Term, columns_of, in_words
 from sysid.follow_up.unnamed import UnnamedReplays, as_report, fit_unnamed, tables, vehicle_of, with_start_angles
+from sysid.follow_up.wrench_tables import Products, WrenchTable, few_terms, gains_without, shift
+from sysid.follow_up.wrench_terms import Term, columns_of, in_words
 from sysid.logs.manoeuvre_library import make_command
 from sysid.logs.records import OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import base_values
@@ -130,7 +130,7 @@ def test_soft_places_in_the_room_are_fitted_on_a_map(bench, monkeypatch):
     soft = np.where(truth.knots.prod(-1) > 0, -60.0, 0.0)  # two corners: neither x nor y by itself tells them
     measure(bench, truth, np.concatenate([soft, np.zeros(KNOTS)]))
     monkeypatch.setattr("sysid.follow_up.unnamed.tables", lambda _: [truth])  # five drives are too few to choose by,
-    monkeypatch.setattr("sysid.follow_up.tables.SMOOTHING", (0.01,))  # the smoothing too
+    monkeypatch.setattr("sysid.follow_up.wrench_tables.SMOOTHING", (0.01,))  # the smoothing too
     found = fit_unnamed(bench)
     assert found.cost[1] < 1.1 < 1.3 < found.cost[0] and not found.terms
     assert found.wrench[:KNOTS][soft < 0].mean() < -20 < found.wrench[:KNOTS][soft == 0].mean()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.follow_up.terms import HARMONICS, Term, columns_of, forward_selection, library
+from sysid.follow_up.wrench_terms import HARMONICS, Term, columns_of, forward_selection, library
 from sysid.missing.unexplained import PHASES, WHEELS, align, wave_turns
 from whill_mjx.effects.unnamed import ACROSS, KNOTS, MAP, PERIODIC, QUANTITIES
 
