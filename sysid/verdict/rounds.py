@@ -28,6 +28,8 @@ Fits end by themselves long before the last number where the base lies near the 
 the base may go far: cut short, the next effect would be credited with what the fit before it had not yet found."""
 ELSEWHERE = (1.0, 3.0)
 """Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
+NEARER = (0.3, 0.1, 0.03)
+"""Shares of an effect's coordinates from which a fit starts where the whole of them fit no better than none."""
 SIDE = 2.0
 """Coordinate from which such a fit starts on either side of what only changes the effect."""
 Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
@@ -115,7 +117,7 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
     def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
         return [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes) for h, q in listed]
 
-    fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
+    fits = refitter.fit_all(nearer(refitter, starts(chosen), current), FIRST_LOOK)
     asked.report(f"refits, round {number}")
     least = current.cost - asked.thresholds.form * max((current.cost - fit.cost for fit in fits), default=0.0)
     best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
@@ -130,10 +132,22 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
     similar = np.where(asked.similar > asked.thresholds.form, asked.similar, 0.0)
     rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
-    fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
+    fits += refitter.fit_all(nearer(refitter, starts(chosen[len(fits) :]), current), POLISH)
     asked.report(f"rivals, round {number}")
     candidates = [candidate_of(asked, h, fit, current) for (h, _), fit in zip(chosen, fits, strict=True)]
     return sorted(candidates, key=lambda one: -one.gain)
+
+
+def nearer(refitter: Refitter, starts: Sequence[Start], current: Refit) -> list[Start]:
+    """Starts of joint fits with one more effect than `current`. Where the drives fit no better with it, its coordinates
+    are shortened to where they fit best: a linear scan says little of the way to a large effect, and a fit that starts
+    beyond a ridge would look as if there were nothing to gain."""
+    out = list(starts)
+    for i in np.flatnonzero(refitter.costs(out) >= current.cost):
+        q, size = out[i].q, len(current.q)
+        ways = [replace(out[i], q=np.append(q[:size], share * q[size:])) for share in (1.0, *NEARER)]
+        out[i] = ways[int(np.argmin(refitter.costs(ways)))]
+    return out
 
 
 def rescan(asked: Asked, current: Refit) -> Looked:

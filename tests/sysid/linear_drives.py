@@ -66,5 +66,10 @@ class Linear:
     def stuck(self, _):
         return False
 
+    def costs(self, starts):
+        left = [self.evidence.residual - self.evidence.design @ self.values_at(one.hypotheses, one.u, one.q)
+                for one in starts]
+        return np.array([np.square(one).sum() for one in left])
+
     def fit_all(self, starts, _):
         return [self.fit(start.hypotheses, None) for start in starts]

@@ -23,7 +23,7 @@ from sysid.verdict.found import Candidate, Effort
 from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
 from sysid.verdict.result import LoopConfig
-from sysid.verdict.rounds import Asked, begin
+from sysid.verdict.rounds import Asked, begin, nearer
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 
@@ -112,6 +112,14 @@ class Slow(Linear):
         residual = end.residual - end.jacobian @ away
         return replace(end, u=(at + away)[:size], q=(at + away)[size:], cost=float(np.square(residual).sum()),
                        residual=residual)
+
+
+def test_a_fit_starts_where_the_drives_fit_better_than_without_the_effect():
+    linear = Linear(drives((0.0, 0.0, 1.0, 0.0)))
+    current = linear.fit((), None)
+    starts = [JointStart(EFFECTS[2:3], current.u, np.array([size])) for size in (1.5, 8.0)]
+    first, second = nearer(linear, starts, current)
+    assert first is starts[0] and second.q == pytest.approx([0.8])
 
 
 def test_no_effect_is_credited_with_what_the_fit_before_it_had_not_found_yet():
