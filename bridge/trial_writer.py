@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import IO, Any
 
+from bridge.exits import OptionError
 from bridge.mcap_file import McapWriter
 
 COLUMNS = {
@@ -51,11 +52,11 @@ class TrialWriter:
             ValueError: as the constructor.
         """
         if not TRIAL_NAME.fullmatch(trial):
-            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
-                             "Choose another name, like circle_1.")
+            raise OptionError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
+                              "Choose another name, like circle_1.")
         folder = Path(dataset) / "trials" / trial
         if folder.exists():
-            raise ValueError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
+            raise OptionError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
         return folder
 
     def begin(self, t: float) -> None:
@@ -98,11 +99,11 @@ class TrialWriter:
         """Add the yaw rate [rad/s] of an inertial measurement unit."""
         self._add("imu", t, gyro, stamp)
 
-    def message(self, topic: str, kind: Any, data: bytes) -> None:
-        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file."""
+    def message(self, topic: str, kind: Any, data: bytes, received: int = 0) -> None:
+        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file; times as `McapWriter`."""
         if self._mcap is None:
             self._mcap = McapWriter(self._partial / MCAP)
-        self._mcap.write(topic, kind, data)
+        self._mcap.write(topic, kind, data, received)
 
     def flush(self) -> None:
         """Hand the rows so far to the operating system."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.controller import Controller
+from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
 
 pytestmark = pytest.mark.quick
@@ -29,6 +30,18 @@ class ScriptedPolicy:
     steps: int = 0
     resets: int = 0
     novelty: float = 0.0
+
+    @property
+    def commands(self):
+        return self.contract
+
+    @property
+    def sensors(self):
+        return {"image": self.pacer}
+
+    @property
+    def pacer(self):
+        return SensorInput("image", "camera", (self.contract.height, self.contract.width, 3))
 
     def reset(self):
         self.steps = 0

@@ -8,6 +8,7 @@ import tomllib
 
 import pytest
 
+from bridge.exits import Exit
 from bridge.record import believed, finish, main, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 from bridge.split_writer import SplitWriter
@@ -102,6 +103,26 @@ def test_a_split_recording_without_motion_writes_no_trial_and_one_that_goes_sile
     assert [folder.name for folder in writer.trials] == ["walk_1"]
 
 
+def test_whole_messages_of_a_standstill_wait_on_disk_and_keep_their_time_of_receipt(tmp_path, monkeypatch):
+    """An hour of images before a drive: the trial has those of its last three seconds, and the memory none."""
+    now, kept = [0.0], []
+    monkeypatch.setattr("bridge.split_writer.time.time_ns", lambda: int(now[0] * 1e9))
+    monkeypatch.setattr(TrialWriter, "message", lambda self, *message: kept.append(message))
+    writer = SplitWriter(tmp_path, "walk", 3.0, lambda folder, rows: None, lambda: now[0])
+    for i in range(3600):
+        now[0] = float(i)
+        writer.message("image", bytes, bytes([i % 256]) * 100_000)
+    assert len(writer._waiting) == 0 and sum(len(index) for _, _, index in writer._spool._parts) <= 8
+    on_disk = sum(file.seek(0, os.SEEK_END) for _, file, _ in writer._spool._parts)
+    assert on_disk <= 800_000 and not list(tmp_path.iterdir())  # files without a name: nothing is left of a killed one
+    writer.odometry(now[0], 0.0, 0.0, 0.0, 0.3, 0.0)
+    assert [(data[0], received) for _, _, data, received in kept] == [
+        (i % 256, i * 1_000_000_000) for i in (3596, 3597, 3598, 3599)]
+    writer.message("image", bytes, b"moving")
+    assert kept[-1] == ("image", bytes, b"moving") and not writer._spool._parts
+    writer.close()
+
+
 def test_values_that_are_not_finite_are_left_out(tmp_path):
     writer = TrialWriter(tmp_path, "a")
     writer.ground_truth(0.0, 0.0, 0.0, 0.0)
@@ -183,7 +204,7 @@ def test_recording_of_a_killed_recorder_is_recovered_without_its_torn_row(tmp_pa
     assert [row["x"] for row in rows] == [0.0, 0.05, 0.1] and rows[2]["stamp"] == 100.2
     assert "recovered" in capsys.readouterr().err
     gone.mkdir()
-    assert main(["--recover", str(tmp_path)]) == 2 and "exists already" in capsys.readouterr().err
+    assert main(["--recover", str(tmp_path)]) == Exit.FAULT and "exists already" in capsys.readouterr().err
 
 
 def test_yaw_rate_of_an_imu_is_kept_with_its_stamps(tmp_path):
