@@ -65,7 +65,7 @@ def _drive(plant: OnlinePlant, table: CommandTable, writer: TrialWriter) -> None
     for row in range(len(table.v)):
         writer.command(row * PERIOD, float(table.v[row]), float(table.omega[row]))
     for t, x, y, yaw, v, omega in rows.tolist():
-        writer.odometry(t, x, y, yaw, v, omega, t)
+        writer.odometry(t, (x, y, yaw), (v, omega), t)
     for t, x, y, yaw in poses.tolist():
         writer.ground_truth(t, x, y, yaw, t)
     writer.close()

@@ -151,8 +151,7 @@ class DriveNode(VehicleNode):
         if self.options.compressed:
             command = self.controller.on_compressed(now, stamp, age, message.data)
         else:
-            command = self.controller.on_image(now, stamp, age, message.height, message.width, message.encoding,
-                                               message.step, message.data)
+            command = self.controller.on_image(now, stamp, age, message)
         self._took_paced(now, stamp, age, command)
 
     def _on_paced(self, sensor: SensorInput) -> Callable[[Any], None]:

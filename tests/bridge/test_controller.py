@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.controller import Controller
+from bridge.image import RawImage
 from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
 
@@ -65,8 +66,10 @@ class World:
         self.now += dt
         self.count += 1
         data = bytes([self.count % 200 + 20]) * 192
-        fields = dict(stamp=self.now, stamp_age=0.0, height=8, width=8, encoding="rgb8", step=24, data=data)
-        return self.controller.on_image(self.now, **{**fields, **changes})
+        times = {"stamp": self.now, "stamp_age": 0.0}
+        fields = {"height": 8, "width": 8, "encoding": "rgb8", "step": 24, "data": data} | changes
+        times = {name: fields.pop(name, usual) for name, usual in times.items()}
+        return self.controller.on_image(self.now, **times, image=RawImage(**fields))
 
     def tick(self, dt):
         self.now += dt
