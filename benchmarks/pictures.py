@@ -65,7 +65,7 @@ def _drive(seed: int) -> list[np.ndarray]:
     def pictures(state: Any, path: Any) -> tuple[Any, Any, Any]:
         position, rotation = camera_pose(env.model, state.vehicle.qpos)
         lens = pinhole(env.model.spec.camera.fov_y, CAMERA, CAMERA)
-        seen = render(position, rotation, lens, state.scene, CAMERA, CAMERA, best)
+        seen = render(position, rotation, lens, state.scene, best)
         return seen, observe(env, state), top_view(large, state, path)
 
     @jax.jit
@@ -222,8 +222,8 @@ def office(out: Path) -> None:
     def view(key: jax.Array) -> jax.Array:
         scene, start = map_scene_sampler(made)(key)
         position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], 0.1, 0.0)
-        scene = shown(scene, position, rotation, lens, 234)
-        return render(position, rotation, lens, scene, 176, 234, Quality(antialias=True))
+        scene = shown(scene, position, rotation, lens)
+        return render(position, rotation, lens, scene, Quality(antialias=True))
 
     views = [np.asarray(view(jax.random.key(seed)))[..., ::-1] for seed in (0, 1, 2)]
     column_of = np.concatenate([np.pad(one, ((0, 11), (12, 0), (0, 0)), constant_values=255) for one in views])

@@ -205,6 +205,7 @@ def look_alikes(settings: Benchmark) -> None:
     from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
     from sysid.missing.drives import make_drives
     from sysid.missing.signatures import gather
+    from sysid.replay.records import FreeVehicle
     from sysid.verdict.classes import imitation
 
     days = reference_days(settings.work / "plant")
@@ -217,7 +218,7 @@ def look_alikes(settings: Benchmark) -> None:
         full = with_catalogue(reference.params, found)
         base = base_values(full)
         plant = vehicle_plant(logs[0].spec, VehicleConfig())
-        drives = make_drives(plant, full, tuple(base), logs[0].training)
+        drives = make_drives(FreeVehicle(plant, full, tuple(base)), logs[0].training)
         at = drives.simulate(np.array([list(base.values())]))[0]
         evidence, _ = gather(drives.weighted(at, reference.factors, logs[0].spec.track), reference, found, full)
         members = classes(imitation(evidence, found), found)

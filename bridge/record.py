@@ -175,7 +175,7 @@ class RecordNode:
     def _on_odometry(self, message: Any) -> None:
         speed, stamp = message.twist.twist, ros.stamp_seconds(message.header.stamp)
         t = self._time(stamp)
-        self._write(lambda writer: writer.odometry(t, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
+        self._write(lambda writer: writer.odometry(t, planar_pose(message), (speed.linear.x, speed.angular.z), stamp))
 
     def _on_ground_truth(self, message: Any) -> None:
         stamp = ros.stamp_seconds(message.header.stamp)

@@ -181,7 +181,8 @@ class MovedSimulator(ChairSimulator):
         poses = poses_among_people(fastest, task.omega_max, self.period, spec.body_length / 2, spec.body_width / 2)
 
         def look(state: Any, motion: Any, command: Any) -> Any:
-            vehicle = place(env.model, params, *motion)
+            x, y, yaw, v, omega = motion
+            vehicle = place(env.model, params, x, y, yaw, (v, omega))
             count = state.step_count + 1
             ran_into = jnp.asarray(False)
             if state.scene.people is not None:

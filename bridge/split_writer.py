@@ -4,7 +4,7 @@ import itertools
 import tempfile
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -84,10 +84,10 @@ class SplitWriter:
         """Add a command."""
         self._take("command", (t, v, omega), bool(v or omega))
 
-    def odometry(self, t: float, *values: float) -> None:
-        """Add what the odometry reports: x, y [m], yaw [rad], v [m/s], omega [rad/s] and, where it has one, a stamp."""
-        v, omega = values[3:5]
-        self._take("odometry", (t, *values), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
+    def odometry(self, t: float, pose: Sequence[float], twist: Sequence[float], stamp: float = 0.0) -> None:
+        """Add what the odometry reports, as of `TrialWriter`."""
+        v, omega = twist
+        self._take("odometry", (t, pose, twist, stamp), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
 
     def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
         """Add an outside measurement."""

@@ -230,7 +230,8 @@ def record_motion(
             state = substep(model, params, state, command)
             return state, observe(state)
 
-        first = place(model, params, *start)
+        x, y, yaw, v, omega = start
+        first = place(model, params, x, y, yaw, (v, omega))
         last, rest = jax.lax.scan(physics, first, command)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), observe(first), rest), last.diverged
 

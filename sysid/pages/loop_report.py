@@ -76,7 +76,7 @@ from sysid.errors.noise_level import said
 from sysid.follow_up.calibrated import calibrated
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
-from sysid.follow_up.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
+from sysid.follow_up.power import DRAWS, POWER, SEED, Days, false_alarms, power_curve, smallest
 from sysid.follow_up.trust import (
     CONFIDENCE,
     advice,
@@ -104,6 +104,7 @@ from sysid.verdict.falsifiers import as_report as predictions_of
 from sysid.verdict.forms import forms_of
 from sysid.verdict.found import EFFORT
 from sysid.verdict.result import LoopConfig, Result
+from sysid.verdict.scan import null_days
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before, refitter_of
 from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe, get_values
@@ -129,8 +130,7 @@ def make_report(result: Result) -> dict[str, Any]:
         result, wrench, trials)
     rows = error_rows(trials, before, after)
     refitted_rows = error_rows(trials, before, refitted)
-    days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
-                          found.scan, seed=result.config.seed)
+    days = new_days(result)
     about = [one.name for one in result.references]
     vehicle = f"the vehicle of {', '.join(about)}" if about else "the vehicle file"
     asked = (f"what has changed or is missing against {vehicle}"
@@ -171,6 +171,14 @@ def make_report(result: Result) -> dict[str, Any]:
         "next_manoeuvre": next_manoeuvre(result), "base": base, "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
+
+
+def new_days(result: Result) -> Days:
+    """Days on which nothing is missing, simulated anew for these drives."""
+    evidence, wander = scanned(result), result.prepared.wander
+    nulls = null_days(evidence, result.reference.spread, wander, DRAWS,
+                      np.random.default_rng((result.config.seed, SEED)))
+    return Days(evidence, result.hypotheses, wander, result.search.scan, nulls)
 
 
 def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:

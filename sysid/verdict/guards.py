@@ -10,25 +10,25 @@ from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, si
 from sysid.verdict.falsification import put_to_test
 from sysid.verdict.found import Search
 from sysid.verdict.posterior import Thresholds, contradicted
-from sysid.verdict.result import Stood
+from sysid.verdict.result import Support
 
 
 def stand(
     found: Search, refitter: Refitter, trials: Sequence[Trial], groups: Sequence[Sequence[int]], track: float,
     p_excess: Callable[[float], float],
-) -> list[Stood]:
+) -> list[Support]:
     """The evidence for each effect of the final fit, in its order."""
     fit, out = found.final, []
     tested = put_to_test(fit, refitter, trials, groups, track, p_excess)
     for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
         sizes, errors = sizes_apart(fit, part, groups, refitter.precision)
         gains = foretold(fit, part, groups, refitter.precision)
-        out.append(Stood(one.effect, sizes, errors, heterogeneity(sizes, errors), gains, interval_of_sum(gains),
+        out.append(Support(one.effect, sizes, errors, heterogeneity(sizes, errors), gains, interval_of_sum(gains),
                          tuple(tested[number])))
     return out
 
 
-def guarded(found: Search, stood: Sequence[Stood], thresholds: Thresholds) -> Search:
+def guarded(found: Search, stood: Sequence[Support], thresholds: Thresholds) -> Search:
     """The search without a name where one of its effects is contradicted."""
     named = {one.hypothesis.effect for one in found.accepted}
     against = [each for one in stood if one.effect in named for each in one.against(thresholds)]

@@ -14,9 +14,8 @@ from sysid import command_line
 from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log
-from sysid.missing.catalogue import PARAMETER, base_values
+from sysid.missing.catalogue import PARAMETER
 from sysid.missing.days import Reference, Wander
-from sysid.missing.drives import make_drives
 from sysid.missing.evidence import Evidence
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
@@ -30,7 +29,7 @@ from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
-from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
+from sysid.verdict.result import LoopConfig, Prepared, Result, Support
 from sysid.verdict.rounds import Asked, begin
 from sysid.verdict.search import pairs_of, settle
 from sysid.verdict.sensor_noise import compared, with_noise
@@ -38,15 +37,15 @@ from sysid.verdict.sensor_noise import compared, with_noise
 
 def find_missing(
     log: Log, references: Sequence[Log] = (), config: LoopConfig | None = None, vehicle: Any = None,
-    progress: Progress | None = None, reference: Reference | Prepared | None = None, start: Any = None,
+    progress: Progress | None = None, reference: Reference | Prepared | None = None,
 ) -> Result:
     """Verdict on the training trials of a log; its held-out trials are not looked at.
 
     Args:
         log: the drives in question.
         references: drives of the same vehicle on other days.
-        vehicle: `VehicleParams` fitted before, kept as the reference; or `FittedVehicle`, with what its fit knows.
-        start: `VehicleParams` where the fit of the base model starts, instead of the preset.
+        vehicle: `VehicleParams` fitted before, kept as the reference; or `FittedVehicle`, with what its fit knows, or
+            from which the fit of the base model starts.
         reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
     config = config or LoopConfig()
@@ -55,7 +54,7 @@ def find_missing(
         config = replace(config, pose_delay=True)
     began = time.perf_counter()
     if reference is None:
-        reference = reference_for(log, references, config, vehicle, progress, start)
+        reference = reference_for(log, references, config, vehicle, progress)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
     fitted = time.perf_counter()
     seen = _look(log, ready.without(config.without), config, progress)
@@ -75,7 +74,7 @@ def find_missing(
         usual = replace(asked, wander=seen.usual)
         nulls = run_null_refits(usual, judge, pairs, config.refit_nulls, config.seed, progress)
         outcome = checked(outcome, nulls, seen.ready.wander, config.thresholds)
-    stood: tuple[Stood, ...] = ()
+    stood: tuple[Support, ...] = ()
     if outcome.verdict == "named":
         # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
         p_excess = (lambda _: 1.0) if alone else seen.usual.p_excess
@@ -106,15 +105,11 @@ class Seen:
 
 def _look(log: Log, ready: Prepared, config: LoopConfig, progress: Progress | None) -> Seen:
     """Noise and signatures of the training trials."""
-    reference, names, values = ready.reference, ready.names, base_values(ready.full)
-    base = np.array([values[name] for name in names])
-    drives = make_drives(ready.plant, ready.full, names, log.training, reference.width, ready.paths, reference.gyro)
-    at = drives.simulate(base[None])[0]
-    drives = drives.weighted(at, reference.factors, log.spec.track)
-    noise = compared(drives, at, reference, config.thresholds.alpha)
+    drives, at = ready.drives(log.training, log.spec.track)
+    noise = compared(drives, at, ready.reference, config.thresholds.alpha)
     usual, ready = ready.wander, with_noise(ready, noise)
     evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
-    return Seen(ready, usual, noise, evidence, Refitter(drives, ready.reference, base, slopes))
+    return Seen(ready, usual, noise, evidence, Refitter(drives, ready.reference, ready.values, slopes))
 
 
 def _asked(log: Log, seen: Seen, config: LoopConfig, progress: Progress | None) -> Asked:
@@ -124,20 +119,19 @@ def _asked(log: Log, seen: Seen, config: LoopConfig, progress: Progress | None) 
     def anything(residual: np.ndarray) -> float:
         return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
 
-    draws = min(config.draws, 300) if config.quick else config.draws
-    return begin(seen.evidence, seen.ready.hypotheses, seen.refitter, seen.ready.wander, config.thresholds, anything,
-                 draws, config.seed, progress)
+    return begin(seen.evidence, seen.ready, seen.refitter, config, anything, progress)
 
 
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
     """`find_missing` with a progress bar. With references, `vehicle` is where the fit to them starts."""
-    start = None if vehicle is None or not references else vehicle.params
-    kept = vehicle if start is None else None
+    if vehicle is not None:
+        vehicle = replace(vehicle, kept=not references)
+    kept = vehicle is not None and vehicle.kept
     progress, close = command_line.progress_bar(
-        expected_steps(config, len(days_of(references)), kept is not None), "close the loop")
+        expected_steps(config, len(days_of(references)), kept), "close the loop")
     progress(0, "reference vehicle")
     try:
-        return find_missing(log, references, config, kept, progress, start=start)
+        return find_missing(log, references, config, vehicle, progress)
     finally:
         close()
 

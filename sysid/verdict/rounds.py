@@ -18,6 +18,7 @@ from sysid.verdict.agreement import beside, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.found import EFFORT, Candidate, PairScan, Scan, Search
 from sysid.verdict.posterior import Thresholds
+from sysid.verdict.result import LoopConfig, Prepared
 from sysid.verdict.scan import best, run
 
 FIRST_LOOK, POLISH, TO_ITS_END = 4, 8, 60
@@ -77,11 +78,12 @@ class Asked:
 
 
 def begin(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    anything: Callable[[np.ndarray], float] = lambda _: 0.0, draws: int = 1000, seed: int = 0,
-    progress: Progress | None = None,
+    evidence: Evidence, ready: Prepared, refitter: Refitter, config: LoopConfig,
+    anything: Callable[[np.ndarray], float] = lambda _: 0.0, progress: Progress | None = None,
 ) -> Asked:
-    """What a search asks, around the base refitted to the drives."""
+    """What a search asks about a prepared vehicle, around the base refitted to the drives; `anything` as of `Asked`."""
+    hypotheses, wander = ready.hypotheses, ready.wander
+
     def report(text: str) -> None:
         if progress is not None:
             progress(1, text)
@@ -90,10 +92,10 @@ def begin(
     report("base refit")
     far = best(Solver(evidence), hypotheses, wander)
     evidence = at_fit(evidence, base.residual, base.jacobian, base.u - refitter.reference.u)
-    scan = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
+    scan = run(evidence, hypotheses, refitter.reference.spread, wander, config.nulls, config.seed)
     report("scan")
-    return Asked(evidence, hypotheses, refitter, wander, thresholds, base, scan, imitation(evidence, hypotheses),
-                 anything, report, far)
+    return Asked(evidence, hypotheses, refitter, wander, config.thresholds, base, scan,
+                 imitation(evidence, hypotheses), anything, report, far)
 
 
 def candidates_of(asked: Asked, found: Search, current: Refit) -> list[Candidate]:

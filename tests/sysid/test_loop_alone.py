@@ -22,6 +22,7 @@ from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
 from sysid.verdict.found import Candidate, Effort
 from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
+from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import Asked, begin, nearer
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
@@ -72,10 +73,15 @@ def test_windows_without_replicates_are_put_into_eighths_and_replicates_are_not(
     assert not stands_alone(again, known=False)
 
 
+def asked_of(evidence, refitter):
+    ready = SimpleNamespace(hypotheses=EFFECTS, wander=no_wander(evidence.columns))
+    return begin(evidence, ready, refitter, LoopConfig(draws=300))
+
+
 def verdict(sizes, wheels=True, **more):
     """The verdict on linear drives that stand alone."""
     evidence = drives(sizes, **more)
-    asked = begin(evidence, EFFECTS, Linear(evidence), no_wander(evidence.columns), Thresholds(), draws=300)
+    asked = asked_of(evidence, Linear(evidence))
     return search_alone(asked, wheels=wheels)
 
 
@@ -118,7 +124,7 @@ def test_a_fit_starts_where_the_drives_fit_better_than_without_the_effect():
 
 def test_no_effect_is_credited_with_what_the_fit_before_it_had_not_found_yet():
     evidence = drives((0.0, 0.0, 2.0, 0.0))
-    asked = begin(evidence, EFFECTS, Slow(evidence), no_wander(evidence.columns), Thresholds(), draws=300)
+    asked = asked_of(evidence, Slow(evidence))
     small = replace(asked.scan, q=tuple(0.1 * q for q in asked.scan.q))  # a linear scan may be far off
     found = search_alone(replace(asked, far=None, scan=small))
     exact = verdict((0.0, 0.0, 2.0, 0.0))

@@ -94,9 +94,9 @@ def test_of_an_older_file_the_noise_is_assumed(known):
 def test_the_other_uses_name_the_same(known):
     """Against another day, starting at the preset or at the vehicle of the file, and alone."""
     file, _, plain, sloping = known
-    fitted = load_fitted(file)[1].params
-    for references, start in (((plain,), None), ((plain,), fitted), ((), None)):
-        found = find_missing(sloping, references, CONFIG, start=start)
+    start = FittedVehicle(load_fitted(file)[1].params, kept=False)
+    for references, vehicle in (((plain,), None), ((plain,), start), ((), None)):
+        found = find_missing(sloping, references, CONFIG, vehicle)
         assert found.search.verdict == "named" and "slope" in found.search.classes[0]
 
 
