@@ -8,11 +8,11 @@ when frames do not.
 import time
 import zlib
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from bridge.image import ImageError
+from bridge.image import ImageError, RawImage
 from bridge.policy import Policy
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.senses import PATIENCE, Senses
@@ -70,18 +70,17 @@ class Controller:
         self._ticks = 0
         self._uniform: dict[str, int] = {}  # uniform images in a row of each camera
 
-    def on_image(self, now: float, stamp: float, stamp_age: float, message: Any) -> Command | None:
+    def on_image(self, now: float, stamp: float, stamp_age: float, image: RawImage) -> Command | None:
         """Take one camera message; return the command to publish, None where there is none to send now.
 
         Args:
             now: steady time of receipt [s].
             stamp: stamp of the message [s].
             stamp_age: time of receipt minus stamp, on the clock that made the stamp [s].
-            message: has the fields of sensor_msgs/Image: height, width, encoding, step, data.
+            image: the message, sensor_msgs/Image.
         """
-        self.image_bytes = message.height * message.step
-        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.raw(
-            message.height, message.width, message.encoding, message.step, message.data))
+        self.image_bytes = image.height * image.step
+        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.raw(image))
 
     def on_compressed(self, now: float, stamp: float, stamp_age: float, data: object) -> Command | None:
         """Take one sensor_msgs/CompressedImage, JPEG or PNG; times and result as of `on_image`."""

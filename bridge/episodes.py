@@ -86,7 +86,7 @@ def receive(connection: socket.socket, wait: float | None) -> dict[str, Any] | N
 
 
 def _read(connection: socket.socket, count: int) -> bytes | None:
-    """Return so many bytes, None where the connection ends before; after the first byte PATIENCE holds."""
+    """Return this many bytes, None where the connection ends before; after the first byte PATIENCE holds."""
     parts = bytearray()
     while len(parts) < count:
         part = connection.recv(count - len(parts))

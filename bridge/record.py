@@ -175,7 +175,7 @@ class RecordNode:
     def _on_odometry(self, message: Any) -> None:
         speed, stamp = message.twist.twist, ros.stamp_seconds(message.header.stamp)
         t = self._time(stamp)
-        self._write(lambda writer: writer.odometry(t, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
+        self._write(lambda writer: writer.odometry(t, planar_pose(message), (speed.linear.x, speed.angular.z), stamp))
 
     def _on_ground_truth(self, message: Any) -> None:
         stamp = ros.stamp_seconds(message.header.stamp)
@@ -273,9 +273,9 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--recover", action="store_true", help="only give recordings of killed recorders their place")
     parser.add_argument("--split", type=in_range(0.5, 600), metavar="SECONDS",
                         help="make a trial of each drive, TRIAL_1, TRIAL_2 and so on; a drive is over when the vehicle "
-                        "has stood for so long")
+                        "has stood this long")
     parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
-                        help="end after so long; 0: at Ctrl-C or SIGTERM")
+                        help="end after this long; 0: at Ctrl-C or SIGTERM")
     parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     add_dataset_options(parser)
     options = parser.parse_args(arguments)

@@ -12,6 +12,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -100,11 +101,22 @@ def subscribe_own(node: Any, kind: Any, topic: str, callback: Callable[[Any], No
 def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any], None],
                      incompatible: Callable[[Any], None], lost: Callable[[Any], None]) -> None:
     """Subscribe to a camera, with callbacks for an unfit publisher and, where the middleware reports them, losses."""
-    subscribe_counting_losses(node, kind, topic, callback, best_effort(), lost, incompatible_qos=incompatible)
+    subscribe_counting_losses(node, Topic(kind, topic, best_effort()), callback, lost, incompatible_qos=incompatible)
 
 
-def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any,
-                              lost: Callable[[Any], None], raw: bool = False, **callbacks: Any) -> Any:
+@dataclass(frozen=True)
+class Topic:
+    """What is subscribed to."""
+
+    kind: Any
+    """Class of its messages."""
+    name: str
+    profile: Any
+    """Quality of service."""
+
+
+def subscribe_counting_losses(node: Any, topic: Topic, callback: Callable[[Any], None], lost: Callable[[Any], None],
+                              raw: bool = False, **callbacks: Any) -> Any:
     """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription.
 
     With `raw` the callback gets the serialised message.
@@ -116,10 +128,10 @@ def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callab
         from rclpy.qos_event import UnsupportedEventTypeError  # type: ignore[attr-defined, no-redef]
     try:
         events = subscription_events(message_lost=lost, **callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
+        return node.create_subscription(topic.kind, topic.name, callback, topic.profile, event_callbacks=events, **more)
     except UnsupportedEventTypeError:
         events = subscription_events(**callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
+        return node.create_subscription(topic.kind, topic.name, callback, topic.profile, event_callbacks=events, **more)
 
 
 def message_type(kind: str) -> Any:

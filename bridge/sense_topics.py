@@ -75,7 +75,7 @@ def reader_of(sensor: SensorInput, unwrap: Callable[[str, np.ndarray], np.ndarra
         view = View(sensor.size)
 
         def image(message: Any) -> Reading:
-            value = view.raw(message.height, message.width, message.encoding, message.step, message.data)
+            value = view.raw(message)
             return value, zlib.crc32(value.data)
 
         return image

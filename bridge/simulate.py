@@ -181,7 +181,8 @@ class MovedSimulator(ChairSimulator):
         poses = poses_among_people(fastest, task.omega_max, self.period, spec.body_length / 2, spec.body_width / 2)
 
         def look(state: Any, motion: Any, command: Any) -> Any:
-            vehicle = place(env.model, params, *motion)
+            x, y, yaw, v, omega = motion
+            vehicle = place(env.model, params, x, y, yaw, (v, omega))
             count = state.step_count + 1
             ran_into = jnp.asarray(False)
             if state.scene.people is not None:
@@ -318,11 +319,11 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         "of --vehicle")
     parser.add_argument("--wheels", nargs="+", metavar="NAME",
                         help="of --robot: joints or actuators of its driven wheels, left and right")
-    parser.add_argument("--episodes", type=whole(0), default=0, help="end after so many; 0: never")
+    parser.add_argument("--episodes", type=whole(0), default=0, help="end after this many episodes; 0: never")
     parser.add_argument("--seed", type=whole(0), default=0, help="of the first episode; each next one adds 1")
     parser.add_argument("--wait", type=in_range(0), default=10.0,
-                        help="wait so long for a driver before the first one [s]")
-    parser.add_argument("--linger", type=in_range(0), default=1.0, help="listen for so long after the last episode [s]")
+                        help="wait this long for a driver before the first episode [s]")
+    parser.add_argument("--linger", type=in_range(0), default=1.0, help="listen this long after the last episode [s]")
     parser.add_argument("--results", type=result_file, help="JSON file for the outcome of the episodes")
     parser.add_argument("--image-size", type=whole(1, 10_000), nargs=2, metavar=("HEIGHT", "WIDTH"),
                         help="enlarge the camera image")

@@ -4,7 +4,7 @@ import itertools
 import tempfile
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -51,7 +51,7 @@ class Spool:
 class SplitWriter:
     """Takes what a `TrialWriter` takes, and makes a trial of each drive.
 
-    A trial begins so many seconds before the first motion, and ends when the vehicle has stood for as long. What comes
+    A trial begins some seconds before the first motion, and ends when the vehicle has stood for as long. What comes
     while it stands longer is dropped.
     """
 
@@ -84,10 +84,10 @@ class SplitWriter:
         """Add a command."""
         self._take("command", (t, v, omega), bool(v or omega))
 
-    def odometry(self, t: float, *values: float) -> None:
-        """Add what the odometry reports: x, y [m], yaw [rad], v [m/s], omega [rad/s] and, where it has one, a stamp."""
-        v, omega = values[3:5]
-        self._take("odometry", (t, *values), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
+    def odometry(self, t: float, pose: Sequence[float], twist: Sequence[float], stamp: float = 0.0) -> None:
+        """Add what the odometry reports, as of `TrialWriter`."""
+        v, omega = twist
+        self._take("odometry", (t, pose, twist, stamp), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
 
     def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
         """Add an outside measurement."""

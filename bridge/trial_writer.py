@@ -4,6 +4,7 @@ import contextlib
 import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -75,13 +76,15 @@ class TrialWriter:
         else:
             self._add("command", t, v, omega)
 
-    def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float, stamp: float = 0.0) -> None:
+    def odometry(self, t: float, pose: Sequence[float], twist: Sequence[float], stamp: float = 0.0) -> None:
         """Add what the vehicle's odometry reports; it is moved to start at the origin with heading 0, yaw unwrapped.
 
-        `stamp` [s] is the message's own time, on whatever clock the vehicle has; 0 where it has none.
+        `pose` is x, y [m] and yaw [rad], `twist` v [m/s] and omega [rad/s]. `stamp` [s] is the message's own time, on
+        whatever clock the vehicle has; 0 where it has none.
         """
         if self._is_early("odometry", t):
             return
+        x, y, yaw = pose
         if self._first_pose is None or self._yaw is None:
             self._first_pose, self._yaw = (x, y, yaw), yaw
         x0, y0, yaw0 = self._first_pose
@@ -89,7 +92,7 @@ class TrialWriter:
         dx, dy = x - x0, y - y0
         along = math.cos(yaw0) * dx + math.sin(yaw0) * dy
         left = -math.sin(yaw0) * dx + math.cos(yaw0) * dy
-        self._add("odometry", t, along, left, self._yaw - yaw0, v, omega, stamp)
+        self._add("odometry", t, along, left, self._yaw - yaw0, *twist, stamp)
 
     def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
         """Add an outside measurement of the drive-axle centre in the room."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from bridge.exits import OptionError
-from bridge.image import Crop, ImageError, compressed_size, compressed_to_rgb8, to_rgb8
+from bridge.image import Crop, ImageError, RawImage, compressed_size, compressed_to_rgb8, to_rgb8
 from bridge.parameters import load_yaml
 from bridge.policy import SensorInput
 
@@ -163,11 +163,11 @@ class View:
         """
         self.size, self.crop, self.rectifier = size, crop, rectifier
 
-    def raw(self, height: int, width: int, encoding: str, step: int, data: object) -> np.ndarray:
-        """Return the image (H, W, 3) uint8 of the fields of sensor_msgs/Image; errors as of `to_rgb8`."""
+    def raw(self, image: RawImage) -> np.ndarray:
+        """Return the image (H, W, 3) uint8 of a sensor_msgs/Image; errors as of `to_rgb8`."""
         if self.rectifier is None:
-            return to_rgb8(height, width, encoding, step, data, self.size, self.crop)
-        return self.rectifier(to_rgb8(height, width, encoding, step, data, (height, width)))
+            return to_rgb8(image, self.size, self.crop)
+        return self.rectifier(to_rgb8(image, (image.height, image.width)))
 
     def compressed(self, data: bytes) -> np.ndarray:
         """Return the image (H, W, 3) uint8 of a JPEG or PNG; errors as of `compressed_to_rgb8`."""

@@ -48,7 +48,7 @@ class Converted:
 
     @classmethod
     def of(cls, network: Network, check_steps: int) -> "Converted":
-        """Convert a network and compare both over so many recurrent steps on random observations."""
+        """Convert a network and compare both over this many recurrent steps on random observations."""
         model = to_onnx(network)
         return cls(network, model, parity(model, network, check_steps))
 

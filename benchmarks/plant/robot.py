@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.plant.base import TICK
 from benchmarks.plant.draw import draw_effect
 from benchmarks.plant.effects import EFFECTS
-from benchmarks.plant.make import plan
+from benchmarks.plant.make import Experiment, plan
 from benchmarks.plant.online import OnlinePlant
 from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, EpisodeServer, number
@@ -173,7 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
     effects = {} if options.draw is None else draw_effect(options.draw, options.effect)
     if options.answers:
         ros.write_json(options.answers, {"effects": effects, "seed": options.seed})
-    setting, _ = plan(effects, options.seed, options.noise, True)
+    setting, _ = plan(Experiment(effects, options.seed, options.noise, True))
     plant = OnlinePlant(setting)
     failures: list[ValueError] = []
     with ros.node_session("contact_plant", ros_arguments) as node:
