@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from whill_mjx.env import observe
-from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.io.fields import Field
+from whill_mjx.sensors.base import IMAGE, Reading, Sensor, View
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,7 @@ class Camera(Sensor):
 
     name: ClassVar[str] = "camera"
     visual: ClassVar[bool] = True
+    ranges: ClassVar[tuple[Field, ...]] = IMAGE
 
     height: int | None = None
     """Rows; None takes those of the environment."""
