@@ -36,6 +36,15 @@ LOOK_PERIOD = 0.1
 """Seconds between two looks for publishers."""
 
 
+def check_dataset(dataset: Path) -> None:
+    """Raise ValueError for a folder that holds somebody's files and no dataset."""
+    if dataset.is_dir() and not (dataset / "dataset.toml").exists():
+        others = sorted(one.name for one in dataset.iterdir() if one.name != "trials" and not one.name.startswith("."))
+        if others:
+            raise ValueError(f"{dataset}: holds {others[0]} and no dataset.toml. Give the folder of a dataset, or "
+                             "a new one.")
+
+
 def write_dataset_file(dataset: Path, options: argparse.Namespace) -> None:
     """Write dataset.toml unless the dataset has one: what was driven, and its nominal geometry."""
     path = dataset / "dataset.toml"
@@ -351,6 +360,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.recover:
         return main_recover(options.dataset)
     try:
+        check_dataset(options.dataset)
         writer: TrialWriter | SplitWriter
         if options.split:
             writer = SplitWriter(options.dataset, options.trial, options.split, say_trial)
