@@ -12,9 +12,11 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn
 
+from bridge.exits import Exit
+
 
 def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
-    """Let a command's `main` return 130 after one line where Ctrl-C comes before or after its node spins."""
+    """Let a command's `main` return `Exit.STOPPED` after one line where Ctrl-C comes before or after its node spins."""
 
     @wraps(main)
     def guarded(arguments: list[str] | None = None) -> int:
@@ -23,7 +25,7 @@ def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int
         except KeyboardInterrupt:
             name = getattr(main.__globals__.get("__spec__"), "name", "bridge")
             print(f"{name}: stopped (SIGINT)", file=sys.stderr)
-            return 130
+            return Exit.STOPPED
 
     return guarded
 
@@ -51,7 +53,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and end with code 2."""
         print(f"{self.prog}: {' '.join(message.split()).rstrip('.')}. See --help.", file=sys.stderr)
-        raise SystemExit(2)
+        raise SystemExit(int(Exit.REFUSED))
 
 
 def in_range(

@@ -116,7 +116,7 @@ class DreamerConfig:
     """Updates of the world model alone on these steps, before the first counted one."""
 
     mirror: int = 0
-    """How many times more to remember every step, as the environment's mirror shows it in so many other worlds. Steps
+    """How many times more to remember every step, as the environment's mirror shows it in this many other worlds. Steps
     and ratio count the real ones."""
 
     horizon: float = 333.0
@@ -124,7 +124,7 @@ class DreamerConfig:
     imag_horizon: int = 15
     """Imagined steps."""
     imag_last: int = 0
-    """Imagine from the last so many states of each sequence, and train the critic's replay loss there; 0 means all."""
+    """Imagine from the last N states of each sequence, and train the critic's replay loss there; 0 means all."""
     return_lambda: float = 0.95
     """Lambda of the returns."""
     entropy_scale: float = 3e-4

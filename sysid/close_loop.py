@@ -22,9 +22,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from whill_mjx.io.command_line import SEED, Range, With, check_known, listen, refusing, starts
+from whill_mjx.io.heartbeat import say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 from sysid import command_line
 from sysid.logs.log import of_file

@@ -15,6 +15,7 @@ import pytest
 
 from bridge import chair, guard, record, simulate
 from bridge import drive as bridge_drive
+from bridge.exits import Exit
 from sysid import close_loop, convert, design, fit, inspect, paper, report, searches
 from sysid.logs.conversion import ConvertConfig
 from sysid.pages.paper_page import PaperConfig
@@ -277,6 +278,10 @@ BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulat
           "guard": guard.main}  # fmt: skip
 
 
+DAMAGED = {("drive", "nowhere"), ("drive", "file"), ("drive", "empty"), ("record", "file t"), ("simulate", "nowhere")}
+"""Where a file is at fault, and not the command."""
+
+
 @pytest.mark.parametrize("command, words, told", [
     ("drive", "", "policy"), ("drive", "nowhere", "nowhere"), ("drive", "file", "file"), ("drive", "empty", "empty"),
     ("drive", "nowhere --v-limits nan 1", "--v-limits"), ("drive", "nowhere --slew -1 1", "--slew"),
@@ -315,7 +320,8 @@ def test_a_mistake_in_the_bridge_ends_with_one_line(command, words, told, mistak
     except SystemExit as ended:
         code = ended.code
     lines = capsys.readouterr().err.splitlines()
-    assert code == 2 and len(lines) == 1 and told in lines[0], (code, lines)
+    wanted = Exit.FAULT if (command, words) in DAMAGED else Exit.REFUSED
+    assert code == wanted and len(lines) == 1 and told in lines[0], (code, lines)
     assert files_of(mistakes) == before
 
 

@@ -75,7 +75,7 @@ class DriveOptions:
     held_out: tuple[str, ...] = ()
     """Manoeuvres that the dataset declares as never to be fitted."""
     seed: Annotated[int, SEED] = 0
-    """Of start poses and noise."""
+    """Random seed of start poses and noise."""
     scenario: Scenario = field(default_factory=Scenario)
     """How hard the manoeuvres are driven."""
 
@@ -230,7 +230,8 @@ def record_motion(
             state = substep(model, params, state, command)
             return state, observe(state)
 
-        first = place(model, params, *start)
+        x, y, yaw, v, omega = start
+        first = place(model, params, x, y, yaw, (v, omega))
         last, rest = jax.lax.scan(physics, first, command)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), observe(first), rest), last.diverged
 

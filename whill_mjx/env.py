@@ -491,8 +491,8 @@ def observe(env: Env, state: State) -> jax.Array:
         return _observe_rich(env, state)
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
     intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
-    scene = shown(state.scene, position, rotation, intrinsics, env.width)
-    image = draw(position, rotation, intrinsics, scene, env.height, env.width)
+    scene = shown(state.scene, position, rotation, intrinsics)
+    image = draw(position, rotation, intrinsics, scene)
     if not env.photometric:
         return image
     return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))
@@ -518,8 +518,8 @@ def _observe_rich(env: Env, state: State) -> jax.Array:
     metered = [jnp.log(floor_light(lights, *(then[:2] + far * ahead)) + 1e-4) for far in METERED]
     exposure = 0.5 * jnp.exp(-sum(metered) / len(METERED))
     rich = dataclasses.replace(state.scene.rich, lights=dataclasses.replace(lights, exposure=exposure))
-    scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics, env.width)
-    image = draw(position, rotation, intrinsics, scene, env.height, env.width, RICH)
+    scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics)
+    image = draw(position, rotation, intrinsics, scene, RICH)
     turning = state.vehicle.qvel[5] * SHUTTER * intrinsics.fx
     return develop(image, eye, turning, jax.random.fold_in(state.key, state.step_count), state.step_count)
 

@@ -84,7 +84,7 @@ class EvaluateOptions:
     near: Annotated[float, NOT_NEGATIVE] = NEAR_M
     """Distance below which there is a near miss [m]."""
     seed: Annotated[int, SEED] = 2_000_003
-    """Of the episodes; training and its own evaluations use others."""
+    """Random seed of the episodes; training and its own evaluations use others."""
     batch: Annotated[int, Range(1, 1_000_000)] = 1000
     """Episodes at a time."""
     runtime: Literal["jax", "onnxruntime"] = "jax"
@@ -190,8 +190,10 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
     if options.html:
         from whill_mjx.evaluation.pages import page
 
-        say(f"report: {page(evaluation, pictures, videos, options.out / 'report.html')}")
-    say(f"{options.out / 'evaluation.json'}: {evaluation['seconds']:.0f} s")
+        say(f"open {page(evaluation, pictures, videos, options.out / 'report.html')} in a browser")
+    files = ", ".join(["evaluation.json", *(one.name for one in (*pictures, *videos))])
+    say(f"wrote {files} in {options.out}; {evaluation['seconds']:.0f} s"
+        + ("" if options.html else ". With --html you get one page with everything."))
     return evaluation
 
 

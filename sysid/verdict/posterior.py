@@ -7,7 +7,7 @@ a saved file can be judged again, with other priors too (`python -m sysid.verdic
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -225,14 +225,19 @@ def _decide(findings: Findings, priors: Thresholds) -> tuple[str, int | None, fl
     share = 0.0 if one is None else findings.named(one, priors)
     if one is not None and share >= priors.share:
         if against := findings.against.get("+".join(one.effects), []):
-            return ("unexplained", chosen, share, f"{' and '.join(sorted(one.effects))} would explain {share:.0%} of "
-                    f"what can be explained, but {'; '.join(against)}")
+            return "unexplained", chosen, share, contradicted(one.effects, share, against)
         return "named", chosen, share, f"explains {share:.0%} of what can be explained"
     if not missing(findings.p_refit if one is None else one.p_value, p_excess, priors):
         return "none", None, 0.0, "what stands out has no name, and days with nothing missing differ by as much"
     after = findings.excess if one is None else one.left.excess
     return ("unexplained", chosen, share, f"the best of the catalogue explains {share:.0%} of what can be explained, "
             f"and {after:.0%} above the noise is left")
+
+
+def contradicted(effects: Iterable[str], share: float, against: Iterable[str]) -> str:
+    """Why effects are not named."""
+    return (f"{' and '.join(sorted(effects))} would explain {share:.0%} of what can be explained, but "
+            f"{'; '.join(against)}")
 
 
 def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:

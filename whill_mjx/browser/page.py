@@ -142,7 +142,8 @@ def _chart(runs: Sequence[Run], name: str, title: str) -> str:
         x, y = curve(run.lines, name)
         if len(x):
             lines.append(Line(x, y, "", _colour(k), markers=len(x) < (40 if name.startswith("eval/") else 3)))
-    return line_chart(lines, "environment steps", "", title, Axes(width=340, height=230)) if lines else ""
+    share = (0.0, 1.0) if name.partition("/")[2] in ("success", "collision") else ()
+    return line_chart(lines, "environment steps", "", title, Axes(340, 230, covers=share)) if lines else ""
 
 
 def _colour(index: int) -> str:

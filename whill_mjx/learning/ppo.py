@@ -205,7 +205,7 @@ def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
 
 
 def check_minibatches(config: PpoConfig, instances: int) -> None:
-    """Raise ValueError unless the minibatches divide a rollout of so many instances."""
+    """Raise ValueError unless the minibatches divide a rollout of this many instances."""
     if instances * config.rollout % config.minibatches:
         raise ValueError(
             f"{instances} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "
