@@ -22,7 +22,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandListener
-from bridge.exits import Exit, refusal
+from bridge.exits import Exit, OptionError, refusal
 from bridge.mcap_file import mend
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
 from bridge.split_writer import SplitWriter
@@ -38,11 +38,11 @@ LOOK_PERIOD = 0.1
 
 
 def check_dataset(dataset: Path) -> None:
-    """Raise ValueError for a folder that holds somebody's files and no dataset."""
+    """Raise OptionError for a folder that holds somebody's files and no dataset."""
     if dataset.is_dir() and not (dataset / "dataset.toml").exists():
         others = sorted(one.name for one in dataset.iterdir() if one.name != "trials" and not one.name.startswith("."))
         if others:
-            raise ValueError(f"{dataset}: holds {others[0]} and no dataset.toml. Give the folder of a dataset, or "
+            raise OptionError(f"{dataset}: holds {others[0]} and no dataset.toml. Give the folder of a dataset, or "
                              "a new one.")
 
 
