@@ -268,6 +268,8 @@ def _quantity(words: list[str]) -> str | None:
     last = words[-1]
     if match := re.search(r"\b(x|y|z|theta|yaw|heading|psi) (vel|velocity|speed|rate|dot)$", text):
         return {"x": "v", "y": None, "z": None}.get(match[1], "omega")
+    if match := re.search(r"\b(?:vel|velocity|speed|rate|v) (x|y|theta|yaw|heading|psi)$", text):
+        return {"x": "v", "y": None}.get(match[1], "omega")
     if match := re.fullmatch(r"(?:\w+ )?(x|y|theta|yaw|heading) (?:pos|position)", text):
         return match[1] if match[1] in "xy" else "yaw"
     if re.search(r"(orientation|quat\w*|rotation|^q) [wxyz]$", text):
@@ -307,6 +309,8 @@ def _stream(words: list[str], file: list[str], quantity: str, table: Table) -> t
         return "wheels", True
     if quantity in ("qx", "qy", "qz", "qw") or quantity in ("x", "y", "yaw") and {"pose", "position"} & set(words):
         return "ground_truth", False
+    if {"observation", "observed", "obs"} & set(words):
+        return "odometry", True
     if {"linear", "angular"} & set(words):
         return "command", False  # a Twist by itself
     return "odometry", any(_stream_said(name, "command") for name in table.columns)

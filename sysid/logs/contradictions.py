@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.clocks import NONE, RESPONSE, VARIED, WHOLE, another_clock, running_fast
+from sysid.logs.clocks import NONE, RESPONSE, UNLIKE, VARIED, WHOLE, another_clock, running_fast
 from sysid.logs.pose_jumps import constant_columns, frozen, jumps
 from sysid.logs.records import Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
@@ -24,7 +24,7 @@ SURE = 4.0  # standard errors that such an angle must have
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
-PLAINER = 0.1  # share of the motion that another explanation must explain more of
+PLAINER = 0.03  # share of the motion that speeds along the vehicle do not explain, where another frame counts
 
 
 @dataclass(frozen=True)
@@ -86,15 +86,15 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
             WHOLE, plain.explained):
         return [f"{name}: its pose is that of the fixed frame as the vehicle sees it: parent and child are exchanged. "
                 "Invert the transform: (x, y) = -R(-yaw) (x, y), then yaw = -yaw."]
+    if name == "odometry" and _in_fixed_frame(motions):
+        return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
+                "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
     if plain.explained < LITTLE:
         mirrored = _pooled([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
             return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged), "
                     "or yaw is a compass heading. Counter-clockwise is positive yaw; negate y, exchange the axes, or "
                     "take 90 deg - heading."]
-        if name == "odometry" and _in_fixed_frame(motions):
-            return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
-                    "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
         if name == "odometry" and plain.explained < LITTLE / 2:
             return [f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of how "
                     "the pose moves. Check that both are of one vehicle, frame and clock."]
@@ -218,7 +218,8 @@ def _in_fixed_frame(motions: Sequence[Motion]) -> bool:
         x, y = one.steps.T
         fixed.append(_explained(one.v, np.column_stack([x, y])))
         own.append(_explained(one.v, np.column_stack([cos * x + sin * y, -sin * x + cos * y, one.turn])))
-    return bool(np.median(fixed) > max(WHOLE, float(np.median(own)) + PLAINER))
+    left, other = 1 - float(np.median(fixed)), 1 - float(np.median(own))
+    return left < min(1 - WHOLE, UNLIKE * other) and other > PLAINER
 
 
 def _explained(signal: np.ndarray, design: np.ndarray) -> float:
