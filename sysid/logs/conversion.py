@@ -23,7 +23,7 @@ from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, rea
 from sysid.logs.sources import is_lerobot
 from sysid.logs.text_files import TextDrive, join_drives, read_drives, text_files
 from sysid.logs.wheel_states import integrate_speeds
-from whill_mjx.io.command_line import WRITING, Range
+from whill_mjx.io.command_line import WRITING, Range, With
 from whill_mjx.io.fields import COLUMNS, counted
 from whill_mjx.io.folders import unfinished
 from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
@@ -46,7 +46,7 @@ class ConvertConfig:
     """Dataset folder; made where it does not exist, else the trials are added."""
     to: Literal["dataset", "lerobot"] = "dataset"
     """What is written: a driving-log dataset, or a LeRobotDataset v3 of a driving-log dataset."""
-    fps: Annotated[int | None, Range(1, 1000)] = None
+    fps: Annotated[int | None, Range(1, 1000), With("to", ("lerobot",))] = None
     """Frames per second of a LeRobotDataset that is written; by default the rate of the measurements."""
     vehicle: str = "whill_cr"
     """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
@@ -77,7 +77,7 @@ class ConvertConfig:
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
     """One trial per bag, or one per drive between standstills."""
-    pause: Annotated[float, Range(0, 3600)] = 2.0
+    pause: Annotated[float, Range(0, 3600), With("split", ("standstill",))] = 2.0
     """Least standstill between two drives [s]."""
     held_out: tuple[str, ...] = ()
     """Trials that are never to be fitted."""
@@ -86,8 +86,13 @@ class ConvertConfig:
     columns: tuple[str, ...] = ()
     """What columns of CSV files hold, each as ROLE=[FILE/]COLUMN[:UNIT], e.g. command.v=speed_set:km/h; the rest is
     guessed."""
-    command_timeout: float | None = None
+    command_timeout: Annotated[float | None, Range(0.01, 60)] = None
     """How long the base drives on where no command comes [s]; by default a command holds until the next."""
+
+
+OF_RECORDINGS = ("vehicle", "wheel_radius", "track", "mass", "command_topic", "odometry_topic", "truth_topic",
+                 "imu_topic", "input", "stamp", "split")
+"""Options that are for bags and tables."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +148,9 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
 
         if config.columns:
             raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
+        if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
+            raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
+                             "Leave it out.")
         log = load_whole(config.source, config.select)
         spec, notes = log.spec, list(log.notes)
         drives = [trial_drive(trial) for trial in log.trials]

@@ -30,6 +30,10 @@ OTHER = "Robots are read from URDF (<robot>), xacro and MJCF (<mujoco>); export 
 XACRO = "pip install xacro"
 
 
+mujoco.set_mju_user_warning(lambda text: None)
+"""What is wrong in a model is raised; MuJoCo's own handler writes MUJOCO_LOG.TXT where the command was called."""
+
+
 def read_robot(
     path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None,
 ) -> tuple[Any, list[str], dict[str, float] | None]:  # fmt: skip
