@@ -21,7 +21,8 @@ from sysid.logs.metrics import relative_pose
 from sysid.logs.records import Log, PoseStream, Start, Trial
 from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.sources import is_lerobot
-from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
+from sysid.logs.text_files import TextDrive, join_drives, read_drives, text_files
+from sysid.logs.wheel_states import integrate_speeds
 from whill_mjx.io.command_line import WRITING, Range, With
 from whill_mjx.io.fields import COLUMNS, counted
 from whill_mjx.io.folders import unfinished
@@ -132,20 +133,10 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
     held_out = config.held_out
-    if is_lerobot(config.source):
-        episodes = lerobot.read(config.source)
-        spec = _spec(config, episodes.spec)
-        found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], config.columns,
-                            (spec.wheel_radius, spec.track), config.input == "wheels")
-        drives, said, fields = _text_drives(found, config)
-        notes, more = [*episodes.notes, *left, *said], more | fields
-        held_out = held_out or (() if (config.out / "dataset.toml").exists() else episodes.held_out)
-    elif not bags and not is_known(config.source) and text_files(config.source):
-        spec = _spec(config)
-        found, left = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track),
-                                  config.input == "wheels")
-        drives, said, fields = _text_drives(found, config)
-        notes, more = [*left, *said], more | fields
+    if is_lerobot(config.source) or not bags and not is_known(config.source) and text_files(config.source):
+        spec, drives, notes, fields, held = _table_drives(config)
+        more |= fields
+        held_out = held_out or (() if (config.out / "dataset.toml").exists() else held)
     elif bags:
         spec = _spec(config)
         drives, notes, wheels = _any_drives(bags, config, spec)
@@ -219,6 +210,24 @@ def _bags_drives(
         drives += cut_out
         notes += [f"{path.name}: {note}" for note in said]
     return drives, notes, refused
+
+
+def _table_drives(
+    config: ConvertConfig,
+) -> tuple[VehicleSpec, list[Drive], list[str], dict[str, Any], tuple[str, ...]]:
+    """Nominal geometry, trials, notes, fields of dataset.toml and held-out trials of tables or of a LeRobotDataset."""
+    said, wheels = config.columns, config.input == "wheels"
+    if not is_lerobot(config.source):
+        spec = _spec(config)
+        found, left = read_drives(config.source, said, (spec.wheel_radius, spec.track), wheels)
+        drives, notes, fields = _text_drives(found, config)
+        return spec, drives, [*left, *notes], fields, ()
+    episodes = lerobot.read(config.source)
+    spec = _spec(config, episodes.spec)
+    found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], said,
+                              (spec.wheel_radius, spec.track), wheels)
+    drives, notes, fields = _text_drives(found, config)
+    return spec, drives, [*episodes.notes, *left, *notes], fields, episodes.held_out
 
 
 def _text_drives(

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.clocks import another_clock
-from sysid.logs.contradictions import contradictions
+from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import Command, Log, Trial, command_in_force
