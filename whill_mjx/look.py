@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -78,10 +79,20 @@ class Look:
 
 def contact_sheet(env: Env, params: VehicleParams, worlds: int, steps: int, seed: int = 0) -> np.ndarray:
     """Sheet (rows, columns, 3) uint8 of `worlds` worlds, at the size of the camera image."""
-    draw = jax.jit(jax.vmap(lambda key: _column(env, params, key, steps)))
-    pictures = draw(jax.random.split(jax.random.key(seed), worlds))
-    columns = [np.concatenate([np.asarray(picture[world]) for picture in pictures]) for world in range(worlds)]
-    return np.concatenate(columns, axis=1)
+    keys = jax.vmap(partial(jax.random.split, num=3))(jax.random.split(jax.random.key(seed), worlds))
+    reset_keys, plan_keys, drive_keys = keys.T
+    reset = jax.jit(jax.vmap(partial(reset_state, env, params))).trace(reset_keys)
+    see = jax.jit(jax.vmap(partial(observe, env))).trace(reset.out_info)
+    drive = jax.jit(jax.vmap(partial(_drive, env, params, steps=steps))).trace(reset.out_info, plan_keys, drive_keys)
+    above = jax.jit(jax.vmap(partial(top_view, env))).trace(*drive.out_info)
+    with ThreadPoolExecutor() as threads:  # XLA compiles without holding Python's lock
+        programs = [threads.submit(one.lower().compile) for one in (drive, see, above, reset)]
+    run_drive, run_see, run_above, run_reset = (one.result() for one in programs)
+    start = run_reset(reset_keys)
+    later, path = run_drive(start, plan_keys, drive_keys)
+    rows = [np.concatenate(np.asarray(images), axis=1) for images in (
+        run_see(start), run_see(later), run_above(later, path))]  # fmt: skip
+    return np.concatenate(rows)
 
 
 def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array:
@@ -107,14 +118,15 @@ def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array
     height, width = 2 * env.height, env.width
     down = jnp.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # right is -y, down is -x, forward is -z
     focal = jnp.asarray(height * 12.0 / 9.0)  # 9 m of ground over the height
-    intrinsics = Intrinsics(focal, focal, jnp.asarray(width / 2), jnp.asarray(height / 2))
-    return render(eye, down, intrinsics, scene, height, width)
+    intrinsics = Intrinsics(focal, focal, jnp.asarray(width / 2), jnp.asarray(height / 2), height=height, width=width)
+    return render(eye, down, intrinsics, scene)
 
 
-def _column(env: Env, params: VehicleParams, key: jax.Array, steps: int) -> tuple[jax.Array, ...]:
+def _drive(
+    env: Env, params: VehicleParams, start: State, plan_key: jax.Array, drive_key: jax.Array, steps: int
+) -> tuple[State, jax.Array]:
+    """State of one instance after `steps` control periods of the planner, and about twelve points (T, 2) of its way."""
     config = for_task(env.task)
-    reset_key, plan_key, drive_key = jax.random.split(key, 3)
-    start = reset_state(env, params, reset_key)
 
     def one_step(carry, step_key):
         state, plan = carry
@@ -124,7 +136,7 @@ def _column(env: Env, params: VehicleParams, key: jax.Array, steps: int) -> tupl
 
     plan = first_plan(config, env, start, plan_key)
     (later, _), path = jax.lax.scan(one_step, (start, plan), jax.random.split(drive_key, steps))
-    return observe(env, start), observe(env, later), top_view(env, later, path[:: max(1, steps // 12)])
+    return later, path[:: max(1, steps // 12)]
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
@@ -145,14 +157,14 @@ def gallery_sheet(height: int = 96, width: int = 144) -> np.ndarray:
     start, end = walk(jnp.array(0.1)), walk(jnp.array(0.14))
 
     def moving(scene):
-        draw = partial(render, intrinsics=curved, scene=scene, height=height, width=width, quality=best)
+        draw = partial(render, intrinsics=curved, scene=scene, quality=best)
         image = motion_blur(lambda position, rotation: draw(position, rotation), start, end, samples=6)
         warm = Film(jnp.array(1.1), jnp.array([1.06, 1.0, 0.9]), jnp.array(0.45), jnp.array(2.0))
         return develop(image, warm, jax.random.key(0))
 
     plain = dataclasses.replace(scene, finish=None)
-    frame = jax.jit(lambda scene: render_frame(*start, lens, scene, height, width, normals=True))(plain)
-    good = jax.jit(lambda scene: render(*start, lens, scene, height, width, best))(scene)
+    frame = jax.jit(lambda scene: render_frame(*start, lens, scene, normals=True))(plain)
+    good = jax.jit(lambda scene: render(*start, lens, scene, best))(scene)
     depth = depth_picture(np.asarray(frame.depth))
     label = np.asarray(frame.label).astype(int)
     colours = np.random.default_rng(3).integers(40, 256, (label.max() + 1, 3)).astype(np.uint8)[label]
@@ -177,7 +189,7 @@ def film_of(options: Look) -> list[np.ndarray]:
     if options.scene == "gallery":
         scene, lens, best = gallery(), pinhole(1.0, 144, 192), Quality(antialias=True, shadows=True)
         # The scene is an argument: as a constant, XLA would work it out while compiling.
-        draw = jax.jit(lambda share, scene: render(*walk(share), lens, scene, 144, 192, best))
+        draw = jax.jit(lambda share, scene: render(*walk(share), lens, scene, best))
         return [np.asarray(draw(share, scene)) for share in jnp.linspace(0.0, 1.0, 60)]
     env, params = _env(options)
     config, state, plan, plan_key = _start(options, env, params)

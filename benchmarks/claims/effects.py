@@ -63,8 +63,7 @@ CLAIMS = (
         "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
         "it. 1x is the "
         'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns 2x and 4x '
-        "are of the present decision, on 3 and 10 logs, and 6 and 4 beyond the catalogue. The others are of the "
-        "decision before it.",
+        "are of the present decision. The others are of the decision before it.",
         ("figure", "2x", "4x", "2x, twice the noise", "4x, twice the noise", "4x, heavy scooter"),
         tuple(
             (
@@ -76,11 +75,15 @@ CLAIMS = (
             )
             for label, name, form in (
                 ("named right", "class_accuracy", "%"),
+                ("95 % interval: from", "class_accuracy", ".low %"),
+                ("to", "class_accuracy", ".high %"),
+                ("logs", "class_accuracy", ".n"),
                 ("named wrong", "wrong_name", "%"),
                 ("noticed", "noticed", "%"),
                 ("right names with a warning", "warned_right", "%"),
                 ("members of a class", "mean_class_size", ""),
                 ("beyond the catalogue: `unexplained`", "out_of_catalogue", "%"),
+                ("logs", "out_of_catalogue", ".n"),
             )
         ),
     ),

@@ -68,7 +68,7 @@ def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     return Noise(pose, odometry, "replicates", gyro)
 
 
-class Told(Residuals, Protocol):
+class DriveResiduals(Residuals, Protocol):
     """`Objective`, or `sysid.errors.bin_objective.FeatureObjective`: residuals (N, B, K) of B trials."""
 
     @property
@@ -349,7 +349,7 @@ def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np
     return -namespace(design).linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
 
 
-def without_prior(objective: Told, table: np.ndarray) -> np.ndarray:
+def without_prior(objective: DriveResiduals, table: np.ndarray) -> np.ndarray:
     """Table (B, K, ...) of the measurements alone."""
     return table if objective.prior is None else table[:, : -objective.space.size]
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
-from sysid.errors.pose_objective import Noise, Objective, Told, estimate_noise
+from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, estimate_noise
 from sysid.errors.prior import Prior, bounds_alone, make_prior
 from sysid.errors.robust import robust_cost
 from sysid.errors.space import Space, make_space, searched
@@ -119,7 +119,7 @@ def fit_log(
     scan, coarse, points = _first_points(log, given, config, stages)
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
-    chosen: Told = choose(objective, points[0], log.spec.track, config, stages)
+    chosen: DriveResiduals = choose(objective, points[0], log.spec.track, config, stages)
     robust, search = config.robust and config.method not in GLOBAL, None
     stated: tuple[str, ...] = ()
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
@@ -127,7 +127,7 @@ def fit_log(
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, chosen, profiles = gradient_search(chosen, space, points, iterations, config, stages)
+        search, chosen, profiles = gradient_search(chosen, points, iterations, config, stages)
         u, final_cost = search.u, search.cost
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
@@ -179,7 +179,7 @@ def _first_points(
 
 def choose(
     objective: Objective, u: np.ndarray, track: float, config: FitConfig, stages: Stages | None = None
-) -> Told:
+) -> DriveResiduals:
     """Choose the last objective of a search, whole poses or motion in bins, with the weight of its prior.
 
     Least squares of whole poses are efficient where only the sensors err, independently in each sample. Disturbances
@@ -192,8 +192,8 @@ def choose(
     if config.method in GLOBAL:
         return objective
     progress = stages.begin("whole poses") if stages else None
-    near = least_squares.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
-                        progress=progress)
+    near = least_squares.fit(objective, starts=u[None], stop=least_squares.Stopping(TRIED), robust=config.robust,
+                             progress=progress)
     share = uncertainty.inflation(objective, near.u)
     chosen: Objective | FeatureObjective = objective
     if config.method == "features" and share >= TOGETHER:

@@ -17,6 +17,7 @@ from sysid.missing.pose_fit import fit_poses
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import base_columns
 from sysid.replay.models import measured_effects, with_effects
+from sysid.replay.records import FreeVehicle
 from sysid.verdict.result import Result
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 
@@ -90,7 +91,7 @@ def _to_poses(result: Result, vehicle: Any, names: list[str], iterations: int) -
     inside = np.array(known) >= 0
     spread = np.where(np.outer(inside, inside), reference.spread[np.ix_(known, known)], 0.0)
     drives, held = drives_of(result, trials, vehicle)
-    u = fit_poses(drives, trials, space, held, spread, iterations)
+    u = fit_poses(drives, space, held, spread, iterations)
     return vehicle if u is None else set_values(
         vehicle, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
 
@@ -105,21 +106,18 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[
     gyro = result.reference.gyro
     if set(values) <= set(ready.names):
         values = {**base_values(ready.full), **values}
-        drives = make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths, gyro)
+        drives = make_drives(ready.vehicle, trials, width, ready.paths, gyro)
         return drives, np.array([values[name] for name in ready.names])
     kind = ready.plant, jax.tree.structure(vehicle)
-    drives = make_drives(ready.plant, vehicle, tuple(values), trials, width, ready.others.get(kind), gyro)
+    drives = make_drives(FreeVehicle(ready.plant, vehicle, tuple(values)), trials, width, ready.others.get(kind), gyro)
     ready.others[kind] = drives.paths
     return drives, np.array(list(values.values()))
 
 
 def refitter_of(result: Result) -> Refitter:
     """A refitter like that of the search, through the replay that it compiled."""
-    base = base_values(result.full)
-    values = np.array([base[name] for name in result.names])
-    drives = make_drives(result.plant, result.full, result.names, result.log.training, result.reference.width,
-                         result.prepared.paths, result.reference.gyro)
-    drives = drives.weighted(drives.simulate(values[None])[0], result.reference.factors, result.log.spec.track)
+    values = result.prepared.values
+    drives, _ = result.prepared.drives(result.log.training, result.log.spec.track)
     return Refitter(drives, result.reference, values, base_columns(drives, result.reference, values, result.names))
 
 

@@ -90,7 +90,8 @@ def runs_page(runs: Sequence[Run], links: Links, embed: int = MEDIA_BYTES, head:
     sections.append(html.Section("Settings", settings(runs)))
     title = runs[0].name if len(runs) == 1 else f"{len(runs)} runs"
     policy = f'<meta http-equiv="Content-Security-Policy" content="{escaping.escape(POLICY)}">'
-    return html.html_page(title, sections, kind="Runs", lead=meaning(runs), head=head or policy)
+    page = html.html_page(title, sections, kind="Runs", lead=meaning(runs), head=head or policy)
+    return page.encode("utf-8", "replace").decode()  # JSON has letters that no text file can hold
 
 
 def meaning(runs: Sequence[Run]) -> str:
