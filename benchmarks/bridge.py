@@ -242,7 +242,7 @@ def policy_times(policy_path: Path, steps: int) -> np.ndarray:
     from bridge.policy import Policy
 
     policy = Policy.load(policy_path)
-    image = np.full((policy.contract.height, policy.contract.width, 3), 90, np.uint8)
+    image = np.full((*policy.pacer.size, 3), 90, np.uint8)
     times = []
     for _ in range(steps):
         start = time.perf_counter(), time.thread_time()

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -159,8 +160,7 @@ class Operator:
                     if not self._moves(process, before):
                         refused += 1
                         continue
-                    robot.wait_until(lambda _, before=before: self._progress != before or process.poll() is not None,
-                                     PATIENCE)
+                    robot.wait_until(partial(self._is_over, process, before), PATIENCE)
         except AssertionError as error:
             raise StageError(f"bridge.manoeuvre of {plan.name} does not go on ({error}); see "
                              f"{here.log(name)}") from None
@@ -168,6 +168,10 @@ class Operator:
         if code:
             raise StageError(f"bridge.manoeuvre of {plan.name} ended with {code}: {last_line(here.log(name))}; see "
                              f"{here.log(name)}")
+
+    def _is_over(self, process: subprocess.Popen[bytes], before: tuple[int, int], robot: Robot) -> bool:
+        """Whether a replicate was driven or stopped since then, or the process ended."""
+        return self._progress != before or process.poll() is not None
 
     @property
     def _progress(self) -> tuple[int, int]:
@@ -183,7 +187,7 @@ class Operator:
     def _moves(self, process: subprocess.Popen[bytes], before: tuple[int, int]) -> bool:
         """Whether the arming was heard: a hold that comes back in between refuses it."""
         def heard(robot: Robot) -> bool:
-            return self._progress != before or process.poll() is not None or robot.statuses[-1]["state"] == "driving"
+            return self._is_over(process, before, robot) or robot.statuses[-1]["state"] == "driving"
 
         try:
             return bool(self.robot.wait_until(heard, ARMING))
