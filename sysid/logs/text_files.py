@@ -27,6 +27,7 @@ from sysid.logs.columns import (
     unit_named,
     with_unit,
 )  # fmt: skip
+from sysid.logs.wheel_states import integrate_speeds
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
@@ -590,13 +591,3 @@ def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> 
 def _dead_reckoned(rates: np.ndarray) -> np.ndarray:
     """(T, 6) odometry of speeds (T, 3)."""
     return np.column_stack([rates[:, 0], *integrate_speeds(*rates.T), rates[:, 1:]])
-
-
-def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dead reckoning of speeds (T,): x, y and yaw that an odometry would report that only logged its wheels."""
-    dt = np.diff(t)
-    turn = (omega[1:] + omega[:-1]) / 2 * dt
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
-    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
-            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)
