@@ -8,9 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +159,7 @@ class Operator:
                     if not self._moves(process, before):
                         refused += 1
                         continue
-                    robot.wait_until(partial(self._is_over, process, before), PATIENCE)
+                    robot.wait_until(self._has_ended(process, before), PATIENCE)
         except AssertionError as error:
             raise StageError(f"bridge.manoeuvre of {plan.name} does not go on ({error}); see "
                              f"{here.log(name)}") from None
@@ -169,9 +168,9 @@ class Operator:
             raise StageError(f"bridge.manoeuvre of {plan.name} ended with {code}: {last_line(here.log(name))}; see "
                              f"{here.log(name)}")
 
-    def _is_over(self, process: subprocess.Popen[bytes], before: tuple[int, int], robot: Robot) -> bool:
-        """Whether a replicate was driven or stopped since then, or the process ended."""
-        return self._progress != before or process.poll() is not None
+    def _has_ended(self, process: subprocess.Popen[bytes], before: tuple[int, int]) -> Callable[[Robot], bool]:
+        """Return what says whether the replicate is driven or stopped."""
+        return lambda _: self._progress != before or process.poll() is not None
 
     @property
     def _progress(self) -> tuple[int, int]:
@@ -187,7 +186,7 @@ class Operator:
     def _moves(self, process: subprocess.Popen[bytes], before: tuple[int, int]) -> bool:
         """Whether the arming was heard: a hold that comes back in between refuses it."""
         def heard(robot: Robot) -> bool:
-            return self._is_over(process, before, robot) or robot.statuses[-1]["state"] == "driving"
+            return self._progress != before or process.poll() is not None or robot.statuses[-1]["state"] == "driving"
 
         try:
             return bool(self.robot.wait_until(heard, ARMING))
