@@ -17,7 +17,7 @@ from typing import Any
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.commands import endpoints
-from bridge.controller import Controller
+from bridge.controller import Caution, Controller
 from bridge.diagnosis import Evidence, FrameLog, causes, input_cause
 from bridge.exits import Exit, OptionError, refusal
 from bridge.image import ImageError
@@ -239,7 +239,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return refusal(error)
     with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
-        controller = Controller(policy, safety, on_blind=options.blind, on_novel=options.novel,
+        controller = Controller(policy, safety, caution=Caution(options.blind, options.novel),
                                 pace_by_stamp=options.pace == "stamp", view=view)
         drive = DriveNode(node, controller, options)
         try:

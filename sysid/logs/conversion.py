@@ -144,20 +144,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         if wheels:
             more["input"] = "wheels"
     else:
-        from sysid.logs.inspection import load_whole
-
-        if config.columns:
-            raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
-        if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
-            raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
-                             "Leave it out.")
-        log = load_whole(config.source, config.select)
-        spec, notes = log.spec, list(log.notes)
-        drives = [trial_drive(trial) for trial in log.trials]
-        drives = [one if one.ground_truth is None else replace(one, ground_truth=_at_axle(one.ground_truth, config))
-                  for one in drives]
-        if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
-            notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
+        spec, drives, notes = _known_drives(config)
     if not drives:
         raise ValueError(f"{config.source}: no drive in it moves for {SHORTEST:g} s. Check --command-topic, or use "
                          "--split bag.")
@@ -170,6 +157,25 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
+
+
+def _known_drives(config: ConvertConfig) -> tuple[VehicleSpec, list[Drive], list[str]]:
+    """The vehicle and the trials of a dataset or a measured set, and notes."""
+    from sysid.logs.inspection import load_whole
+
+    if config.columns:
+        raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
+    if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
+        raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
+                         "Leave it out.")
+    log = load_whole(config.source, config.select)
+    drives = [trial_drive(trial) for trial in log.trials]
+    drives = [one if one.ground_truth is None else replace(one, ground_truth=_at_axle(one.ground_truth, config))
+              for one in drives]
+    notes = list(log.notes)
+    if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
+        notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
+    return log.spec, drives, notes
 
 
 def _tables_beside(source: Path) -> list[str]:

@@ -98,7 +98,7 @@ class CourseReplay:
         paths = self.paths(np.repeat(values, courses, axis=0), self._replay.batch, np.tile(np.arange(courses), sets))
         paths = paths.reshape(sets, courses, *paths.shape[1:])
         turned = paths[..., TURN] if self._replay.batch.gyro_index is not None else None
-        path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)
+        path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)  # type: ignore[arg-type]
         return self._spread(path, motion=True)
 
     def traced(self, values: jax.Array) -> Simulated:

@@ -381,7 +381,7 @@ def test_a_bag_joins_a_dataset_that_the_recorder_began(bag, tmp_path):
     write_dataset_file(folder, parse_arguments([str(folder), "straight_1"]))
     for t in np.arange(0.0, 4.0, 0.05):
         writer.command(t, 0.5 * (t > 1), 0.0)
-        writer.odometry(t, 0.5 * max(t - 1, 0), 0.0, 0.0, 0.5 * (t > 1), 0.0)
+        writer.odometry(t, (0.5 * max(t - 1, 0), 0.0, 0.0), (0.5 * (t > 1), 0.0))
     writer.close()
     log, _ = convert(ConvertConfig(bag, folder))
     assert [trial.name for trial in log.trials] == ["figure_1", "straight_1"]
