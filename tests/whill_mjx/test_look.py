@@ -33,3 +33,8 @@ def test_unknown_scenes_and_endings_are_refused(tmp_path, options, words):
     with pytest.raises(ValueError, match=words):
         main(Look(scene=options.get("scene", "gallery"), out=out))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.quick
+def test_a_task_that_needs_a_map_is_left_out_of_all():
+    assert "a name is missing" in look._missing(TASKS["map_goal"]) and not look._missing(TASKS["corridor"])
