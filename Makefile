@@ -54,9 +54,10 @@ test: $(VENV)/.installed-dev
 test-quick: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick
 
-# Damage, kills and full disks in numbers: an hour or more.
-test-long: $(VENV)/.installed-dev
+# Damage, kills and full disks in numbers, and the seconds of each notebook: an hour or more.
+test-long: $(VENV)/.installed-dev $(VENV)/.installed-docs
 	$(BIN)/python -m pytest -q -m long
+	$(BIN)/python -m benchmarks.tutorials run --notebooks --record
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/python -m ruff check .

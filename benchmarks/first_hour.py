@@ -56,7 +56,8 @@ def counted() -> dict[str, dict]:
     shown = sum(bool(re.search(r"!\[|^```mermaid", text, re.MULTILINE)) for text in texts)
     path = RESULTS / "people.json"
     known = json.loads(path.read_text())["figures"] if path.exists() else {}
-    run = [name for name, one in known.items() if name.startswith("tutorial_") and one["release"] == __version__]
+    run = [name for name, one in known.items()
+           if re.fullmatch(r"tutorial_\d_s", name) and one["release"] == __version__]  # fmt: skip
     return {"pages_with_picture": figure([shown / len(texts)], "share", "counted"),
             "tutorials_executed": figure([len(run)], "count", "counted")}  # fmt: skip
 

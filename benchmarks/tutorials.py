@@ -2,7 +2,8 @@
 
     python -m benchmarks.tutorials run [--out FOLDER]      all in a row, as they are written, in a folder of their own
     python -m benchmarks.tutorials run --notebooks         the same as Jupyter notebooks (needs jupytext and nbclient)
-    python -m benchmarks.tutorials run --record            writes the seconds of each to benchmarks/results/people.json
+    python -m benchmarks.tutorials run --record            writes the seconds of each, and those that all cores together
+                                                           computed, to benchmarks/results/people.json
     python -m benchmarks.tutorials notebooks --out FOLDER  Jupyter notebooks of the same pages (needs jupytext)
 
 A block ```python or ```sh of a page is run, any other is only shown. A comment before a block changes it in tests:
@@ -254,25 +255,31 @@ def run_notebook(page: Path, tests: bool = False) -> None:
     jupytext.write(notebook, folder / f"{page.stem}.ipynb")
 
 
+def computed() -> float:
+    """Seconds for which the cores worked for this process and for those that it started and that have ended."""
+    return sum(os.times()[:4])
+
+
 def run_all(given: argparse.Namespace) -> dict[str, float]:
-    """Run the pages in a row and return the seconds of each, by its number."""
-    seconds = {}
+    """Run the pages in a row; the figures of each, such as notebook_2_s and notebook_2_cpu_s [s]."""
+    kind, figures = "notebook" if given.notebooks else "tutorial", dict[str, float]()
     for page in pages():
-        if page.name[0] in given.pages:
+        number = page.name[0]
+        if number in given.pages:
             print(f"== {page.name}", flush=True)
-            began = time.perf_counter()
+            began, before = time.perf_counter(), computed()
             (run_notebook if given.notebooks else run_page)(page, tests=given.tests)
-            seconds[page.name[0]] = time.perf_counter() - began
-            print(f"== {page.name}: {seconds[page.name[0]]:.0f} s", flush=True)
-    return seconds
+            taken, cores = time.perf_counter() - began, computed() - before
+            figures |= {f"{kind}_{number}_s": taken, f"{kind}_{number}_cpu_s": cores}
+            print(f"== {page.name}: {taken:.0f} s, {cores:.0f} s of all cores together", flush=True)
+    return figures
 
 
-def write_figures(seconds: dict[str, float], kind: str) -> Path:
-    """Record how long each page took, and how many were run."""
+def write_figures(seconds: dict[str, float]) -> Path:
+    """Record how long each page took."""
     from benchmarks.harness import figure, record
 
-    figures = {f"{kind}_{number}_s": figure([taken], "s") for number, taken in seconds.items()}
-    return record("people", CLAIM, figures)
+    return record("people", CLAIM, {name: figure([taken], "s") for name, taken in seconds.items()})
 
 
 def main() -> None:
@@ -299,7 +306,7 @@ def main() -> None:
     except ModuleNotFoundError as error:
         parser.error(f"{error.name} is not installed. Install it: pip install -c constraints.txt -e '.[docs]'.")
     if given.record:
-        print(write_figures(seconds, "notebook" if given.notebooks else "tutorial"))
+        print(write_figures(seconds))
 
 
 if __name__ == "__main__":

@@ -249,7 +249,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
-        options = parse_arguments(parameters.as_options(ros_arguments, ros.MANOEUVRE_NAME, "commands") + own)
+        options = parse_arguments(parameters.with_options(ros_arguments, ros.MANOEUVRE_NAME, "commands", own))
         table, safety, place = prepare(options)
         if options.dataset and not options.check:
             for number in range(options.first, options.first + options.repeat):

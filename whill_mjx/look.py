@@ -82,18 +82,25 @@ def contact_sheet(env: Env, params: VehicleParams, worlds: int, steps: int, seed
     """Sheet (rows, columns, 3) uint8 of `worlds` worlds, at the size of the camera image."""
     keys = jax.vmap(partial(jax.random.split, num=3))(jax.random.split(jax.random.key(seed), worlds))
     reset_keys, plan_keys, drive_keys = keys.T
-    reset = jax.jit(jax.vmap(partial(reset_state, env, params))).trace(reset_keys)
-    see = jax.jit(jax.vmap(partial(observe, env))).trace(reset.out_info)
-    drive = jax.jit(jax.vmap(partial(_drive, env, params, steps=steps))).trace(reset.out_info, plan_keys, drive_keys)
-    above = jax.jit(jax.vmap(partial(top_view, env))).trace(*drive.out_info)
     with ThreadPoolExecutor() as threads:  # XLA compiles without holding Python's lock
-        programs = [threads.submit(one.lower().compile) for one in (drive, see, above, reset)]
-    run_drive, run_see, run_above, run_reset = (one.result() for one in programs)
+
+        def begin(function, *args):
+            """What the function of one world gives, as shapes, and the program of all, which is being compiled."""
+            traced = jax.jit(jax.vmap(function)).trace(*args)
+            return traced.out_info, threads.submit(lambda: traced.lower().compile())
+
+        start, reset = begin(partial(reset_state, env, params), reset_keys)
+        plan, first = begin(partial(first_plan, for_task(env.task), env), start, plan_keys)
+        (later, path), drive = begin(partial(_drive, env, params, steps=steps), start, plan, drive_keys)
+        _, above = begin(partial(top_view, env), later, path)
+        _, see = begin(partial(observe, env), start)
+    run_reset, run_first, run_drive, run_above, run_see = (
+        one.result() for one in (reset, first, drive, above, see)
+    )
     start = run_reset(reset_keys)
-    later, path = run_drive(start, plan_keys, drive_keys)
-    rows = [np.concatenate(np.asarray(images), axis=1) for images in (
-        run_see(start), run_see(later), run_above(later, path))]  # fmt: skip
-    return np.concatenate(rows)
+    later, path = run_drive(start, run_first(start, plan_keys), drive_keys)
+    images = run_see(start), run_see(later), run_above(later, path)
+    return np.concatenate([np.concatenate(np.asarray(row), axis=1) for row in images])
 
 
 def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array:
@@ -124,7 +131,7 @@ def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array
 
 
 def _drive(
-    env: Env, params: VehicleParams, start: State, plan_key: jax.Array, drive_key: jax.Array, steps: int
+    env: Env, params: VehicleParams, start: State, plan: jax.Array, key: jax.Array, steps: int
 ) -> tuple[State, jax.Array]:
     """State of one instance after `steps` control periods of the planner, and about twelve points (T, 2) of its way."""
     config = for_task(env.task)
@@ -135,8 +142,7 @@ def _drive(
         state, outcome = step_state(env, params, state, action)
         return (state, plan), jnp.stack([outcome.metrics["x"], outcome.metrics["y"]])
 
-    plan = first_plan(config, env, start, plan_key)
-    (later, _), path = jax.lax.scan(one_step, (start, plan), jax.random.split(drive_key, steps))
+    (later, _), path = jax.lax.scan(one_step, (start, plan), jax.random.split(key, steps))
     return later, path[:: max(1, steps // 12)]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import jax
@@ -314,39 +314,68 @@ class Objective:
             if not np.any(sigmas):
                 continue
             sigma = np.maximum(sigmas, 1e-9)  # (B, 3)
-            design = _start_design(values, np.asarray(origin), weight)
-            gain = _start_gain(design, huber_weight(residual[:, :, part]), sigma)  # (N, B, 3, K)
-            error = xp.einsum("nbik,nbk->nbi", gain, residual[:, :, part])
-            residual = xp.concatenate([residual, error / sigma], axis=2)
-            residual = added(residual, (..., part), xp.einsum("nbki,nbi->nbk", design, error))
+            turned = _StartError.of(values, np.asarray(origin), weight, residual[:, :, part])
+            solve = partial(xp.linalg.solve, turned.curvature + sigma[:, None, :] ** -2.0 * np.eye(3))
+            error = -solve(turned.pull(residual[:, :, part])[..., None])  # (N, B, 3, 1)
+            residual = xp.concatenate([residual, error[..., 0] / sigma], axis=2)
+            residual = added(residual, (..., part), turned.moved(error)[..., 0])
             if jacobian is not None:
-                slope = np.einsum("nbik,nbkp->nbip", gain, jacobian[:, :, part])
+                slope = -solve(turned.pull(jacobian[:, :, part]))  # (N, B, 3, P)
                 jacobian = np.concatenate([jacobian, slope / sigma[..., None]], axis=2)
-                jacobian[:, :, part] += np.einsum("nbki,nbip->nbkp", design, slope)
+                jacobian[:, :, part] += turned.moved(slope)
         return residual, jacobian
 
 
-def _start_design(values: Any, origin: np.ndarray, weight: np.ndarray) -> Any:
-    """Whitened derivative (N, B, K, 3) of poses by an error of their start.
+@dataclass(frozen=True)
+class _StartError:
+    """How an error (dx, dy, dyaw) of their start moves whitened poses (N, B, M, 3) x, y, yaw: a rotation about the
+    start and a shift, by the derivatives (wx, 0, -wx ay), (0, wy, wy ax) and (0, 0, wyaw) of the columns."""
 
-    Args:
-        values: (N, B, M, C) of which the first three columns are x, y, yaw.
-        origin: (B, 2) where they start.
-        weight: (B, M, C) one over the noise, 0 where masked.
-    """
-    xp = namespace(values)
-    arm = xp.nan_to_num(values[..., :2] - origin[:, None, :])  # (N, B, M, 2)
-    turned = xp.stack([-arm[..., 1], arm[..., 0], xp.ones_like(arm[..., 0])], axis=-1)  # of x, y, yaw
-    turned = xp.concatenate([turned, xp.zeros_like(values[..., 3:])], axis=-1)
-    columns = [xp.broadcast_to(np.eye(values.shape[-1])[i], values.shape) for i in range(2)]
-    design = xp.stack([*columns, turned], axis=-1)
-    return (design * weight[..., None]).reshape(*values.shape[:2], -1, 3)
+    arm: Any  # (N, B, M, 2) from the start to each pose
+    weight: np.ndarray  # (B, M, C) one over the noise, 0 where masked; behind the third column nothing moves
+    huber: Any  # (N, B, M, 3)
 
+    @classmethod
+    def of(cls, values: Any, origin: np.ndarray, weight: np.ndarray, residual: Any) -> _StartError:
+        """That of poses.
 
-def _start_gain(design: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(N, B, 3, K): start errors of weighted least squares for a residual (K,), with their own noise sigma (B, 3)."""
-    weighted = (design * weight[..., None]).swapaxes(-1, -2)  # (N, B, 3, K)
-    return -namespace(design).linalg.solve(weighted @ design + sigma[:, None, :] ** -2.0 * np.eye(3), weighted)
+        Args:
+            values: (N, B, M, C) of which the first three columns are x, y, yaw.
+            origin: (B, 2) where they start.
+            weight: (B, M, C).
+            residual: (N, B, M C) whitened.
+        """
+        arm = namespace(values).nan_to_num(values[..., :2] - origin[:, None, :])
+        return cls(arm, weight, huber_weight(residual.reshape(values.shape)[..., :3]))
+
+    @property
+    def curvature(self) -> Any:
+        """(N, B, 3, 3) Gauss-Newton Hessians of the start errors, without their own noise."""
+        xp, (x, y) = namespace(self.arm), (self.arm[..., 0], self.arm[..., 1])
+        along, across, turn = (self.huber[..., c] * self.weight[..., c] ** 2 for c in range(3))
+        xx, yy, xt, yt = along.sum(-1), across.sum(-1), -(along * y).sum(-1), (across * x).sum(-1)
+        tt, none = (along * y**2 + across * x**2 + turn).sum(-1), xp.zeros_like(xx)
+        return xp.stack([xp.stack(row, axis=-1) for row in ((xx, none, xt), (none, yy, yt), (xt, yt, tt))], axis=-2)
+
+    def pull(self, table: Any) -> Any:
+        """Half the gradients (N, B, 3, ...) of whitened residuals, or of their derivatives, (N, B, M C, ...)."""
+        more = (1,) * (table.ndim - 3)
+        table = table.reshape(*table.shape[:2], *self.weight.shape[1:], *table.shape[3:])
+        x, y, turn = (table[:, :, :, c] * (self.huber[..., c] * self.weight[..., c]).reshape(*self.arm.shape[:3], *more)
+                      for c in range(3))
+        arm_x, arm_y = (self.arm[..., c].reshape(*self.arm.shape[:3], *more) for c in range(2))
+        sums = [x.sum(2), y.sum(2), (arm_x * y - arm_y * x + turn).sum(2)]
+        return namespace(table).stack(sums, axis=2)
+
+    def moved(self, error: Any) -> Any:
+        """What errors (N, B, 3, P) add to whitened residuals (N, B, M C, P)."""
+        xp, (x, y) = namespace(error), (self.arm[..., c, None] for c in range(2))
+        dx, dy, turn = (error[:, :, None, c] for c in range(3))  # (N, B, 1, P)
+        weight = self.weight[..., None]
+        columns = [(dx - y * turn) * weight[:, :, 0], (dy + x * turn) * weight[:, :, 1], turn * weight[:, :, 2]]
+        columns += [xp.zeros_like(columns[0])] * (weight.shape[2] - 3)
+        moved = xp.stack(columns, axis=3)  # (N, B, M, C, P)
+        return moved.reshape(*error.shape[:2], -1, error.shape[3])
 
 
 def without_prior(objective: DriveResiduals, table: np.ndarray) -> np.ndarray:

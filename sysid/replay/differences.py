@@ -68,15 +68,21 @@ class DifferenceReplay:
 
 
 def make_replay(
-    plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...]
+    plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...], like: Replays | None = None
 ) -> tuple[Replays, Measured]:
-    """Replay of trials with the space's parameters, the others as in `params`, and what was measured."""
+    """Replay of trials with the space's parameters, the others as in `params`, and what was measured.
+
+    Args:
+        like: another replay of this plant, space and vehicle, whose compiled programs serve here too.
+    """
+    paths = like.replay.paths if isinstance(like, DifferenceReplay) else None
+
     def put(values: jax.Array) -> Any:
         return set_parameters(params, space.names, values)
 
     if not isinstance(params, Parameters):
-        courses, measured = make_courses(plant, trials, put, params)
+        courses, measured = make_courses(plant, trials, put, params, paths)
     else:
-        courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed)
+        courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed, paths=paths)
         measured = courses.measured
     return DifferenceReplay(courses, space), measured

@@ -37,6 +37,8 @@ FETCHED = 512  # rows by which what an accelerator sends back grows: each size i
 IN_ONE = 256
 """Drives at most that one function computes: with 128 it takes 0.7 ms for each of 22 s where many functions take 1.1,
 with 512 they take 1.5 and 0.8, for those divide loops among the cores; within one XLA fails to (seen with 1024)."""
+ROOMS = (512, 1024, 2048, 4096)
+"""Records for which one program has room, up to 41 s; longer drives have programs for multiples of the last."""
 UNROLLED = 2  # steps between records at most that `Plant.record` takes: compiling it takes as long as it has steps
 
 
@@ -224,12 +226,30 @@ def path_of(plant: Plant, params: Any, commanded: Commanded, few: bool = False, 
         few: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
         gyro: whether the last column is what a gyro turned [rad].
     """
+    commanded = _from_reference(params, commanded)
+    path = _driven(plant, _driving(plant, params), commanded, few)
+    return _as_sensed(plant, params, commanded, path, gyro)
+
+
+def _driving(plant: Plant, params: Any) -> Any:
+    """The vehicle without effects that `_as_sensed` applies to the whole drive."""
+    params, _ = without(params, SensorDelay.name)
+    return without(params, OdometryLag.name)[0] if plant.frame else params
+
+
+def _from_reference(params: Any, commanded: Commanded) -> Commanded:
+    """The drive from where the vehicle's reference point starts; logs give that of a tracked point."""
+    for effect in getattr(params, "effects", ()):
+        if hasattr(effect, "reference"):
+            commanded = commanded._replace(start=effect.reference(commanded.start))
+    return commanded
+
+
+def _as_sensed(plant: Plant, params: Any, commanded: Commanded, path: jax.Array, gyro: bool) -> jax.Array:
+    """What sensors make of the states (R + 1, 9) of a drive; arguments as of `path_of`."""
     params, latency = without(params, SensorDelay.name)
     params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
-    for effect in getattr(params, "effects", ()):
-        if hasattr(effect, "reference"):  # the start is that of a tracked point
-            commanded = commanded._replace(start=effect.reference(commanded.start))
-    path, gap = _driven(plant, params, commanded, few), plant.dt * commanded.command.shape[1]
+    gap = plant.dt * commanded.command.shape[1]
     turns = jax.lax.stop_gradient(_turns(commanded.start[2] - path[0, 2]))
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
@@ -252,23 +272,19 @@ def path_of(plant: Plant, params: Any, commanded: Commanded, few: bool = False, 
 def _driven(plant: Plant, params: Any, commanded: Commanded, few: bool) -> jax.Array:
     """States (R + 1, 9) of the drive, before what sensors make of them."""
     command, start, warm_up, speeds = commanded
-    params, delay = delay_apart(params)
+    vehicle, _ = delay_apart(params)
     in_one = as_one_function if few and plant.arithmetic else lambda function: function
 
     def after(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
-        state = _advance(plant, params, state, commands)
+        state = _advance(plant, vehicle, state, commands)
         return state, plant.observe(state)
 
     def drive(start: jax.Array, command: jax.Array) -> jax.Array:
-        state, before = plant.place(params, start), None
-        if warm_up:
-            state, before = _settle(plant, params, state, start[3:], warm_up, command.shape[1])
-            state = plant.move(state, start)
-        command = delayed(delay, command, plant.dt, before)
+        state, command = _begun(plant, params, command, start, warm_up)
         if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
             later = in_one(partial(jax.lax.scan, after))(state, command)[1]
         else:
-            later = plant.record(params, state, command)
+            later = plant.record(vehicle, state, command)
         return jnp.concatenate([plant.observe(state)[None], later])
 
     if speeds is None:
@@ -278,10 +294,71 @@ def _driven(plant: Plant, params: Any, commanded: Commanded, few: bool) -> jax.A
     return path.at[-1, 8].set(path[:, 8].max())
 
 
+def _begun(
+    plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int
+) -> tuple[Any, jax.Array]:
+    """State at the start (5,) of a drive, and the commands (R, K, 2) as the vehicle's delay lets them come."""
+    params, delay = delay_apart(params)
+    state, before = plant.place(params, start), None
+    if warm_up:
+        state, before = _settle(plant, params, state, start[3:], warm_up, command.shape[1])
+        state = plant.move(state, start)
+    return state, delayed(delay, command, plant.dt, before)
+
+
+class _Programs:
+    """`path_of` for rows of drives in three programs, of which the large one serves drives of any length.
+
+    The steps of the physics take far longer to compile than all around them. They are counted when it runs, in arrays
+    with room for more records (`ROOMS`).
+    """
+
+    def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
+        in_one = as_one_function if rows <= IN_ONE and plant.arithmetic else lambda function: function
+
+        def begin(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int) -> tuple[Any, jax.Array]:
+            params = set_values(values)
+            commanded = _from_reference(params, Commanded(command, start))
+            state, command = _begun(plant, _driving(plant, params), command, commanded.start, warm_up)
+            room = next((room for room in ROOMS if room >= len(command)), -(-len(command) // ROOMS[-1]) * ROOMS[-1])
+            spare = jnp.zeros((room - len(command), *command.shape[1:]), command.dtype)
+            return state, jnp.concatenate([command, spare])
+
+        def drive(values: jax.Array, state: Any, command: jax.Array, count: jax.Array) -> jax.Array:
+            vehicle, _ = delay_apart(_driving(plant, set_values(values)))
+            first = plant.observe(state)
+            path = jnp.concatenate([first[None], jnp.zeros((len(command), len(first)), first.dtype)])
+
+            def after(number: jax.Array, carry: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
+                state, path = carry
+                state = _advance(plant, vehicle, state, command[number])
+                return state, path.at[number + 1].set(plant.observe(state))
+
+            def steps(state: Any, path: jax.Array, count: jax.Array) -> jax.Array:
+                return jax.lax.fori_loop(0, count, after, (state, path))[1]
+
+            return in_one(steps)(state, path, count)
+
+        def finish(values: jax.Array, path: jax.Array, command: jax.Array, start: jax.Array, gyro: bool) -> jax.Array:
+            params = set_values(values)
+            commanded = _from_reference(params, Commanded(command, start))
+            return _as_sensed(plant, params, commanded, path[: len(command) + 1], gyro)
+
+        self._begin = jax.jit(jax.vmap(begin, in_axes=(0, 0, 0, None)), static_argnums=3)
+        self._drive = jax.jit(jax.vmap(drive, in_axes=(0, 0, 0, None)))
+        self._finish = jax.jit(jax.vmap(finish, in_axes=(0, 0, 0, 0, None)), static_argnums=4)
+
+    def __call__(self, values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int, gyro: bool) -> jax.Array:
+        """Paths (N, R + 1, C) of sets (N, P) and drives with commands (N, R, K, 2) from starts (N, 5)."""
+        state, held = self._begin(values, command, start, warm_up)
+        path = self._drive(values, state, held, jnp.asarray(command.shape[1], jnp.int32))
+        return self._finish(values, path, command, start, gyro)
+
+
 class PathReplay:
     """Compiled `path_of` for rows of a fixed number: each row is a parameter set on one trial of a batch.
 
-    It is compiled once for all batches of the same length, whatever their trials.
+    It is compiled once for all batches, whatever their trials; on an accelerator, for those of the same length.
     """
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
@@ -289,7 +366,8 @@ class PathReplay:
             return path_of(plant, set_values(values), Commanded(command, start, warm_up), rows <= IN_ONE, gyro)
 
         self.rows, self._compiled = rows, False
-        self._run = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None, None)), static_argnums=(3, 4))
+        self._run: Any = _Programs(plant, set_values, rows) if on_processor() else jax.jit(
+            jax.vmap(one, in_axes=(0, 0, 0, None, None)), static_argnums=(3, 4))
 
     def __call__(self, values: np.ndarray, batch: Batch, trials: np.ndarray) -> np.ndarray:
         """Paths (N, R + 1, 9) of sets (N, P), each on the trial of `batch` that trials (N,) names."""

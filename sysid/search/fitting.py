@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
-from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, estimate_noise
+from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, Replays, estimate_noise
 from sysid.errors.prior import Prior, bounds_alone, make_prior
 from sysid.errors.robust import robust_cost
 from sysid.errors.space import Space, make_space, searched
@@ -92,6 +92,8 @@ class Fit:
     """Time between the frames of the odometry [s] (`sysid.logs.odometry_frames`), where they show."""
     stated: tuple[str, ...] = ()
     """Groups of sizes that keep their stated values (`sysid.search.stated`)."""
+    replay: Replays | None = None
+    """Of the training trials; what it has compiled serves other trials too."""
 
 
 def fit_log(
@@ -146,7 +148,7 @@ def fit_log(
     earlier = chosen.prior if config.vehicle is not None else None
     return Fit(fitted, given.params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
                profiles, time.perf_counter() - began, given.plant, earlier, given.model, tuple(traced), given.frame,
-               stated)
+               stated, given.objective.replay)
 
 
 def _first_points(
@@ -339,7 +341,7 @@ def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list
     """Replays of trials with the initial and with the fitted vehicle."""
     if not trials:
         return [], []
-    replay, _ = make_replay(fit.plant, fit.params, fit.space, trials)
+    replay, _ = make_replay(fit.plant, fit.params, fit.space, trials, fit.replay)
     values = np.stack([np.asarray(get_parameters(one, fit.space.names)) for one in (fit.initial_params, fit.params)])
     simulated = replay.simulate(values)
     initial, fitted = (predictions(trials, jax.tree.map(lambda leaf, i=i: leaf[i], simulated)) for i in (0, 1))

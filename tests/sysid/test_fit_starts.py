@@ -10,9 +10,9 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
-from sysid.replay.courses import FEW, MANY, VECTOR, CourseReplay, make_courses, sets_together
+from sysid.replay.courses import FEW, MANY, VECTOR, CourseReplay, make_courses, rows_of_call
 from sysid.replay.models import with_effects
-from sysid.replay.rollout import Replay, make_batch
+from sysid.replay.rollout import PathReplay, Replay, make_batch
 from sysid.search import least_squares, starts
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.parameters import describe, get_values
@@ -124,20 +124,25 @@ def test_effects_are_added_where_they_do_nothing():
         with_effects(params, ("anti_gravity",))
 
 
-@pytest.mark.parametrize("cores", [1, 2, 16])
-@pytest.mark.parametrize("courses", [1, 2, 3, 5, 8, 9, 18, 31])
-def test_drives_that_a_core_replays_together_fill_its_vectors(courses, cores):
-    few, many = sets_together(courses, 53, cores)
-    assert few * courses % VECTOR == 0 and many * courses % VECTOR == 0
-    assert FEW <= few * courses <= many * courses <= MANY + VECTOR * courses
+@pytest.mark.quick
+@pytest.mark.parametrize("courses", [1, 2, 3, 5, 8, 9, 18, 31, 600])
+def test_drives_that_a_core_replays_together_fill_its_vectors(courses):
+    rows = rows_of_call(courses)
+    assert rows % VECTOR == 0 and FEW <= rows <= MANY
 
 
-def test_differences_of_a_jacobian_are_shared_out_evenly():
-    few, many = sets_together(8, 53, cores=2)
-    parts = -(-53 // many)
-    assert parts % 2 == 0 and parts * many - 53 < 4  # neither core waits, little is replayed in vain
-    assert many > few
+def test_drives_of_any_length_share_the_program_of_the_physics(unicycle_log):
+    plain, traced = unicycle_plant(), []
 
+    def substep(params, state, command):
+        traced.append(command.shape)
+        return plain.substep(params, state, command)
 
-def test_of_many_courses_few_sets_are_replayed_together():
-    assert sets_together(600, 53, cores=2) == (4, 4)
+    plant = dataclasses.replace(plain, substep=substep, substeps=None)
+    batch, _ = make_batch(unicycle_log.training[:1], plant.dt)
+    paths, values, first = PathReplay(plant, lambda values: values, VECTOR), np.array([TRUTH]), np.array([0])
+    whole = paths(values, batch, first)
+    count = len(traced)
+    part = paths(values, dataclasses.replace(batch, command=batch.command[:, :40]), first)
+    assert len(traced) == count
+    np.testing.assert_allclose(part, whole[:, :41], atol=1e-6)

@@ -153,6 +153,7 @@ def _typed(where: str, hint: Any, value: Any, name: str) -> Any:
     if hint is str:
         return value
     if origin is dict:
+        assert isinstance(value, dict)
         return {key: _typed(where, inner[1], one, f"{name}.{key}") for key, one in value.items()}
     return origin(_typed(where, inner[0], one, f"{name}[{index}]") for index, one in enumerate(value))
 
