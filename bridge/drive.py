@@ -228,7 +228,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the node until SIGTERM or Ctrl-C; return an `Exit`: FAULT where the policy file is refused."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
-        options = parse_arguments(parameters.as_options(ros_arguments, ros.DRIVE_NAME, "policy") + own)
+        options = parse_arguments(parameters.with_options(ros_arguments, ros.DRIVE_NAME, "policy", own))
         policy = Policy.load(options.policy)
         if options.joystick_lock and not options.require_arm:
             raise OptionError("--joystick-lock takes the joystick from the rider, so an operator must arm. Give "
