@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.harness import figure, record
 from benchmarks.physics import CLAIM
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
 from bridge.options import Parser, whole
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
@@ -30,8 +30,8 @@ FIVE = ("straight", "turn", "circle", "s_curve", "figure_eight")
 
 def logs(seed: int, folder: Path) -> tuple[Log, Log]:
     """One chair's drives as measured, and the same without disturbances and noise."""
-    measured = make_log(folder / "measured", seed=seed, manoeuvres=FIVE)
-    clean = make_log(folder / "clean", seed=seed, noise=0.0, manoeuvres=FIVE, replicates=1)
+    measured = make_log(folder / "measured", Experiment(seed=seed, manoeuvres=FIVE))
+    clean = make_log(folder / "clean", Experiment(seed=seed, noise=0.0, manoeuvres=FIVE, replicates=1))
     return load_log(measured), load_log(clean)
 
 

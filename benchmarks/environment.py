@@ -142,7 +142,7 @@ def rays(options: Options) -> dict[str, Any]:
 
 
 def outside(path: Path) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Function of a place that tells whether it lies outside the space of a map, `SLACK` around it included."""
+    """Whether a place lies outside the space of a map, `SLACK` around it included."""
     from scipy.ndimage import distance_transform_edt
 
     made = make_map_scene(read_map(path))

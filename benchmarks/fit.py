@@ -86,12 +86,12 @@ def few(settings: Benchmark) -> None:
 
 def days(settings: Benchmark, name: str, trials: set[str] | None = None) -> None:
     """Held-out error of fits to days of the contact plant, over replicates; of these trials only, if they are given."""
-    from benchmarks.plant.make import make_log
+    from benchmarks.plant.make import Experiment, make_log
 
     ratios, seconds = [], []
     for seed in settings.seeds:
         with tempfile.TemporaryDirectory() as folder:
-            make_log(Path(folder) / "log", seed=seed)
+            make_log(Path(folder) / "log", Experiment(seed=seed))
             log = load_log(Path(folder) / "log").select(lambda one: trials is None or one.name in trials)
         fit = fit_log(log, settings.fitted())
         ratios.append(against_replicates(fit, log, name)[1]["value"])

@@ -24,7 +24,7 @@ from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
 from sysid.errors.space import NUISANCE, Space, make_space, searched
-from sysid.intervals.independence import Evidence
+from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import Estimate, estimate, uncertainty_of
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
@@ -82,10 +82,11 @@ def plant_log(folder: Path, seed: int, vehicle: str = "chair") -> tuple[Log, dic
     """A log of a day of one of the contact plant's vehicles, and the values of the physical model that are known."""
     from benchmarks.plant.chair import COULOMB, VEHICLES
     from benchmarks.plant.commands import nine
-    from benchmarks.plant.make import make_log
+    from benchmarks.plant.make import Experiment, make_log
 
     tables = {name: table[table[:, 0] < PLANT_LENGTH] for name, table in nine(seed).items() if name in PLANT_MANOEUVRES}
-    make_log(folder / "log", seed=seed, manoeuvres=tables, replicates=REPLICATES, contact=COULOMB, vehicle=vehicle)
+    make_log(folder / "log", Experiment(seed=seed, manoeuvres=tables, replicates=REPLICATES, contact=COULOMB,
+             vehicle=vehicle))
     log = load_log(folder / "log")
     log = replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
     return log, plant_values(VEHICLES[vehicle].on_day(np.random.default_rng([seed, 1])), log.spec)
@@ -176,7 +177,7 @@ def _rows(estimates: Sequence[Estimate], truth: Mapping[str, float]) -> dict[str
                        "identifiable": one.identifiable} for one in estimates if one.name in truth}
 
 
-def save_evidence(path: Path, evidence: Evidence, space: Space) -> None:
+def save_evidence(path: Path, evidence: Information, space: Space) -> None:
     """Keep the evidence of a log, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
@@ -201,7 +202,7 @@ def judged_again(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
                   *(arrays.pop(name) for name in ("low", "high", "initial", "log")))
     numbers: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in arrays.items()}
     known = {name: row["truth"] for name, row in result["parameters"].items()}
-    estimates = uncertainty_of(Evidence(**numbers), space).estimates
+    estimates = uncertainty_of(Information(**numbers), space).estimates
     return {**result, "parameters": _rows(estimates, known)}
 
 

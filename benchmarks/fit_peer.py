@@ -31,7 +31,7 @@ import numpy as np
 from benchmarks.fit_scores import CLAIM
 from benchmarks.harness import figure, record
 from benchmarks.plant.chair import Chair, build
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import estimate_noise
 from sysid.logs.log import load_log
@@ -145,10 +145,10 @@ def fit_peer(log: Log, settings: Peer) -> tuple[Curve, dict[str, float]]:
     current = [""]  # the trial whose residual is being computed
     seen: list[np.ndarray] = []
 
-    def modify(params: Any, predicted: Any, measured: Any, model: Any, everything: bool, state: Any = None,
-               sensor_weights: Any = None) -> tuple[np.ndarray, Any, Any]:
+    def modify(params: Any, predicted: Any, measured: Any, model: Any, everything: bool, **more: Any
+               ) -> tuple[np.ndarray, Any, Any]:
         trial = trials[current[0]]
-        residual = compare(model, wheels, log, trial, np.asarray(state)) / scale
+        residual = compare(model, wheels, log, trial, np.asarray(more["state"])) / scale
         seen.append(residual[:, :2] * scale[:2])
         return residual, measured, measured
 
@@ -230,13 +230,13 @@ def fit_ours(log: Log, settings: Peer) -> tuple[Curve, Curve, dict[str, float], 
     judge = Judge(problem, replace(log, trials=tuple(replace(trial, held_out=True) for trial in log.training)))
 
     def on_poses(objective: Any) -> np.ndarray:
-        return least_squares.fit(objective, space, iterations=settings.iterations, robust=True).u
+        return least_squares.fit(objective, stop=least_squares.Stopping(settings.iterations), robust=True).u
 
     def by_default(objective: Any) -> np.ndarray:
         points = starts.draw(objective, [0], log.spec.track, 0)
         coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS)
         binned = make_features_objective(objective, log.spec.track).renewed(coarse.u)
-        return gradient_search(binned, space, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
+        return gradient_search(binned, coarse.u[None], settings.iterations, FitConfig(), None)[0].u
 
     def timed(search: Callable[[Any], np.ndarray]) -> tuple[Curve, np.ndarray, float]:
         began = time.perf_counter()
@@ -264,7 +264,7 @@ def known_vehicle(log: Log, settings: Peer) -> Any:
 def drive(seed: int) -> Log:
     """A day of the contact plant, all of it to be fitted."""
     with tempfile.TemporaryDirectory() as folder:
-        make_log(Path(folder) / "log", seed=seed, manoeuvres=MANOEUVRES)
+        make_log(Path(folder) / "log", Experiment(seed=seed, manoeuvres=MANOEUVRES))
         log = load_log(Path(folder) / "log")
     return replace(log, trials=tuple(replace(trial, held_out=False) for trial in log.trials))
 

@@ -92,7 +92,7 @@ def start_job(
         stages = Stages(report, 3)
         objective = choose(problem.objective, np.array(coarse["u"]), track, FitConfig(), stages)
         at = np.array([coarse["u"]])
-        found, _, _ = gradient_search(objective, problem.space, at, iterations, FitConfig(), stages)
+        found, _, _ = gradient_search(objective, at, iterations, FitConfig(), stages)
         return {"u": found.u.tolist(), "cost": found.cost, "evaluations": found.evaluations}
 
     drawn = staged(folder / f"{label}_drawn.json", lambda: timed(draw))
@@ -197,13 +197,13 @@ def many_starts(problem: Problem, track: float, count: int, iterations: int, who
     stages = Stages(report, 3)
     objective = choose(problem.objective, coarse.u, track, FitConfig(), stages)
     ends = np.concatenate([coarse.u[None], coarse.starts[1:]])
-    fine = from_all(objective, problem.space, ends, iterations, robust=True, progress=report)
+    fine = from_all(objective, ends, iterations, robust=True, progress=report)
     seconds = time.perf_counter() - began
     done = {"cost": fine.cost, "costs": fine.start_costs.tolist(), "evaluations": coarse.evaluations + fine.evaluations,
             "seconds": seconds, "seconds_draw": drawn - began, "seconds_features": fitted - drawn}
     if not whole:
         return done
-    found, _, _ = gradient_search(objective, problem.space, fine.u[None], iterations, FitConfig(), stages)
+    found, _, _ = gradient_search(objective, fine.u[None], iterations, FitConfig(), stages)
     return {**done, "whole": time.perf_counter() - began, "whole_cost": found.cost}
 
 

@@ -140,7 +140,7 @@ def _run(tree: Path, *arguments: str) -> dict:
         out = Path(folder) / "found.json"
         path = os.pathsep.join([str(tree), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {**os.environ, "PYTHONPATH": path}
-        subprocess.run([sys.executable, str(script), "--out", str(out), *arguments], check=True, cwd=tree,
+        subprocess.run([sys.executable, "-P", str(script), "--out", str(out), *arguments], check=True, cwd=tree,
                        env=environment)
         found: dict = json.loads(out.read_text())
     return found

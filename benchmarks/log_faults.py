@@ -318,6 +318,12 @@ def _pose_late(drives: list[Drive], size: float, random: Random) -> list[Drive]:
     return [{**drive, "ground_truth": drive["ground_truth"] + [size, 0, 0, 0]} for drive in drives]
 
 
+def _clock_fast(drives: list[Drive], size: float, random: Random) -> list[Drive]:
+    """The clock of one stream runs fast or slow, and its times begin with the others'."""
+    name, rate = str(random.choice(["odometry", "ground_truth"])), 1 + size * random.choice([-1.0, 1.0])
+    return [{**drive, name: drive[name] * np.append(rate, np.ones(drive[name].shape[1] - 1))} for drive in drives]
+
+
 def _commands_late(drives: list[Drive], size: float, random: Random) -> list[Drive]:
     """Commands of another clock."""
     return [{**drive, "command": drive["command"] + [size, 0, 0]} for drive in drives]
@@ -373,6 +379,7 @@ FAULTS: Sequence[Fault] = (
     Fault("mirrored", (6.0, 1.0, 0.02), "rad", _mirrored, "left-handed|mirrored", 1.0),
     Fault("tracked body turned", (20.0, 6.0, 1.0), "deg", _body_turned, "of its own heading"),
     Fault("outside pose late", (4.0, 1.5, 0.1), "s", _pose_late, "another clock"),
+    Fault("clock fast", (0.12, 0.06, 0.001), "share", _clock_fast, "its clock runs", 1.0),
     Fault("commands late", (5.0, 2.5, 0.1), "s", _commands_late, "another clock", 1.0),
     Fault("nominal sizes wrong", (0.2, 0.09, 0.01), "share", _sizes, "as far as the odometry says", 1.0),
     Fault("commands cut", (0.7, 0.5, 0.0), "share", _commands_cut, "commands end", 1.0),

@@ -27,7 +27,8 @@ from bridge.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
 CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."
-FITTED = ("clock set forward", "commands pause", "outside pose late", "tracked body turned", "odometry reset")
+FITTED = ("clock set forward", "clock fast", "commands pause", "outside pose late", "tracked body turned",
+          "odometry reset")
 """Faults whose harm to a fit is measured, at all three sizes."""
 WRONG = re.compile("sign is reversed|check its unit")
 """What no fault here is."""

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -201,31 +201,37 @@ class Loop:
 
     def do_loop(self) -> str:
         """Close the loop on these drives."""
-        return self._close("loop", self.out / "drives")
+        return self._close("loop", self.out / "drives", self.days)
 
     def do_proposed(self) -> str:
-        """Drive the manoeuvre that the loop proposes, beside the drives so far."""
+        """Drive the manoeuvre that the loop proposes, with the effect and on the reference days, beside the drives so
+        far.
+
+        The verdict subtracts what the same manoeuvre leaves unexplained on reference days. Where they lack it, all that
+        the fitted vehicle does not know of it, such as reversing at full speed, counts as an effect without a name.
+        """
         commands = self.out / "loop" / "next_command.csv"
         if not commands.exists():
             return "the loop proposes none: nothing is to be separated"
         proposed = json.loads((self.out / "loop" / "report.json").read_text())["next_manoeuvre"]
-        more = self.out / "drives_again"
-        if not more.exists():
-            shutil.copytree(self.out / "drives", self.out / ".drives_again.tmp", dirs_exist_ok=True)
-            os.replace(self.out / ".drives_again.tmp", more)
         start = proposed["start"]
         place = {"x": start["x"], "y": start["y"], "yaw": start["heading"]}
         fitted = (self.options.days_of or self.out) / "fit" / "vehicle.toml"
         check = ("--vehicle-file", str(fitted)) if fitted.exists() else ()
         plan = Plan("proposed", commands, min(proposed["replicates"], 3), place, check)
-        self.drive("proposed", more, [plan], self.seed, self.options.draw)
+        self.drive("proposed", self._copied(self.out / "drives"), [plan], self.seed, self.options.draw)
+        for number, day in enumerate(self.days):  # what a vehicle shows in a new manoeuvre is its form error, too
+            self.drive(f"proposed_{day.name}", self._copied(day), [replace(plan, replicates=1)], FIRST_DAY + number,
+                       None)
         what = f"{proposed['name']}, {plan.replicates} times{self._how}"
         return f"{what}, to separate {' and '.join(proposed['splits'])}"
 
     def do_loop_again(self) -> str:
         """Close the loop on all drives."""
-        more = self.out / "drives_again"
-        return self._close("loop_again", more) if more.exists() else "no further drives"
+        more = self._again(self.out / "drives")
+        if not more.exists():
+            return "no further drives"
+        return self._close("loop_again", more, [self._again(day) for day in self.days])
 
     def do_train(self) -> str:
         """Train a policy in the vehicle that was found."""
@@ -254,8 +260,20 @@ class Loop:
         arrived, collided = (sum(one[name] for one in episodes) for name in ("reached_goal", "collided"))
         return f"{len(episodes)} episodes: {arrived} arrived, {collided} collided"
 
-    def _close(self, stage: str, drives: Path) -> str:
-        self.command(stage, "sysid.close_loop", drives, "--reference", *self.days, "--out", self.out / stage,
+    def _again(self, drives: Path) -> Path:
+        """Folder of this run for drives with the proposed one among them."""
+        return self.out / f"{drives.name}_again"
+
+    def _copied(self, drives: Path) -> Path:
+        """Copy drives to where the proposed one is added, and return the copy."""
+        again, temporary = self._again(drives), self.out / f".{drives.name}_again.tmp"
+        if not again.exists():
+            shutil.copytree(drives, temporary, dirs_exist_ok=True)
+            os.replace(temporary, again)
+        return again
+
+    def _close(self, stage: str, drives: Path, references: list[Path]) -> str:
+        self.command(stage, "sysid.close_loop", drives, "--reference", *references, "--out", self.out / stage,
                      *self._quick())
         report = json.loads((self.out / stage / "report.json").read_text())
         names = [one["name"] for one in report["effects"]]

@@ -14,6 +14,7 @@ from pathlib import Path
 from benchmarks.loop_drives import SLEW, Plan, recorded
 from benchmarks.plant.base import TICK
 from benchmarks.plant.chair import Nominal
+from benchmarks.plant.make import Experiment
 from benchmarks.plant.make import plan as plan_day
 from benchmarks.plant.online import OnlinePlant
 from bridge.command_table import PERIOD, CommandTable, make_table, read_commands
@@ -43,7 +44,7 @@ def drive_directly(
         vehicle="contact plant", wheel_radius=nominal.radius, track=nominal.track, wheelbase=nominal.wheelbase,
         mass=nominal.mass, v_limit=1.0, omega_limit=1.0, odometry_topic="none", ground_truth_topic="none",
         held_out=list(held_out)))
-    plant = OnlinePlant(plan_day(effects, seed, 1.0, True)[0])
+    plant = OnlinePlant(plan_day(Experiment(effects, seed, 1.0, True))[0])
     limit, steepest = LIMITS, (float(SLEW[0]), float(SLEW[1]))
     for number, one in enumerate(plans):
         table = make_table(read_commands(one.commands), (-limit[0], -limit[1]), limit, steepest, str(one.commands))
@@ -64,7 +65,7 @@ def _drive(plant: OnlinePlant, table: CommandTable, writer: TrialWriter) -> None
     for row in range(len(table.v)):
         writer.command(row * PERIOD, float(table.v[row]), float(table.omega[row]))
     for t, x, y, yaw, v, omega in rows.tolist():
-        writer.odometry(t, x, y, yaw, v, omega, t)
+        writer.odometry(t, (x, y, yaw), (v, omega), t)
     for t, x, y, yaw in poses.tolist():
         writer.ground_truth(t, x, y, yaw, t)
     writer.close()

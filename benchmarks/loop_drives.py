@@ -118,70 +118,77 @@ def drive_plans(here: Station, plans: Sequence[Plan], dataset: Path, plant: Sequ
     here.log("plant").unlink(missing_ok=True)
     process = here.start("plant", "benchmarks.plant.robot", *plant)
     client = EpisodeClient(_port(here, process))
-    operator = Robot(here.domain, "operator")
-    operator.watch()
+    operator = Operator(here, client, dataset, record)
     try:
         for number, plan, done in missing:
-            _drive(here, operator, client, dataset, plan, done, 100 * (number + 1), record)
+            operator.drive(plan, done, 100 * (number + 1))
     finally:
-        operator.close()
+        operator.robot.close()
         client.close()
         here.end("plant")
 
 
-def _drive(here: Station, operator: Robot, client: EpisodeClient, dataset: Path, plan: Plan, done: int, index: int,
-           record: Sequence[str]) -> None:
-    """Drive the replicates of a manoeuvre that are missing; the operator brings the vehicle back and arms."""
-    operator.statuses.clear()
-    left = plan.replicates - done
-    name = f"manoeuvre_{plan.name}"
-    process = here.start(name, "bridge.manoeuvre", str(plan.commands), "--trial", plan.name, "--dataset", str(dataset),
-                         "--first", str(done + 1), "--repeat", str(left), "--space", *SPACE, "--slew", *SLEW,
-                         "--base", "generic", "--time", "stamp", *plan.check, *record,
-                         "--ros-args", "-p", "use_sim_time:=true")
+class Operator:
+    """Brings the vehicle back to each start, and arms."""
 
-    def progress() -> tuple[int, int]:
-        state: dict[str, Any] = operator.statuses[-1]["manoeuvre"] if operator.statuses else {}
+    def __init__(self, here: Station, client: EpisodeClient, dataset: Path, record: Sequence[str]) -> None:
+        self.robot = Robot(here.domain, "operator")
+        self.robot.watch()
+        self._here, self._client, self._dataset, self._record = here, client, dataset, record
+
+    def drive(self, plan: Plan, done: int, index: int) -> None:
+        """Drive the replicates of a manoeuvre that are missing; `index` numbers its trials for the plant."""
+        here, robot = self._here, self.robot
+        robot.statuses.clear()
+        left = plan.replicates - done
+        name = f"manoeuvre_{plan.name}"
+        process = here.start(name, "bridge.manoeuvre", str(plan.commands), "--trial", plan.name, "--dataset",
+                             str(self._dataset), "--first", str(done + 1), "--repeat", str(left), "--space", *SPACE,
+                             "--slew", *SLEW, "--base", "generic", "--time", "stamp", *plan.check, *self._record,
+                             "--ros-args", "-p", "use_sim_time:=true")
+        refused = 0
+        try:
+            while self._progress[0] < left and process.poll() is None:
+                robot.wait_until(lambda _: self._is_ready(process), PATIENCE)
+                before = self._progress
+                if before[1] + refused > TRIES:
+                    raise StageError(f"{plan.name} was stopped {before[1]} times; see {here.log(name)}")
+                if process.poll() is None:
+                    self._client.call("reset", seed=index + done + before[0], **(plan.start or {}))
+                    robot.arm()
+                    if not self._moves(process, before):
+                        refused += 1
+                        continue
+                    robot.wait_until(lambda _, before=before: self._progress != before or process.poll() is not None,
+                                     PATIENCE)
+        except AssertionError as error:
+            raise StageError(f"bridge.manoeuvre of {plan.name} does not go on ({error}); see "
+                             f"{here.log(name)}") from None
+        code = process.wait(PATIENCE)
+        if code:
+            raise StageError(f"bridge.manoeuvre of {plan.name} ended with {code}: {last_line(here.log(name))}; see "
+                             f"{here.log(name)}")
+
+    @property
+    def _progress(self) -> tuple[int, int]:
+        """Replicates that were driven, and stopped."""
+        state: dict[str, Any] = self.robot.statuses[-1]["manoeuvre"] if self.robot.statuses else {}
         return int(state.get("driven", 0)), int(state.get("aborted", 0))
 
-    def ready(robot: Robot) -> bool:
-        last = robot.statuses[-1] if robot.statuses else {"state": ""}
+    def _is_ready(self, process: subprocess.Popen[bytes]) -> bool:
+        """Whether the next replicate may be armed, or none comes any more."""
+        last = self.robot.statuses[-1] if self.robot.statuses else {"state": ""}
         return process.poll() is not None or last["state"] == "disarmed" and not last["holds"]
 
-    def moves(before: tuple[int, int]) -> bool:
+    def _moves(self, process: subprocess.Popen[bytes], before: tuple[int, int]) -> bool:
         """Whether the arming was heard: a hold that comes back in between refuses it."""
         def heard(robot: Robot) -> bool:
-            return progress() != before or process.poll() is not None or robot.statuses[-1]["state"] == "driving"
+            return self._progress != before or process.poll() is not None or robot.statuses[-1]["state"] == "driving"
 
         try:
-            return operator.wait_until(heard, ARMING)
+            return bool(self.robot.wait_until(heard, ARMING))
         except AssertionError:
             return False
-
-    def wait_for_end(before: tuple[int, int]) -> None:
-        """Wait until the replicate is driven or stopped."""
-        operator.wait_until(lambda _: progress() != before or process.poll() is not None, PATIENCE)
-
-    refused = 0
-    try:
-        while progress()[0] < left and process.poll() is None:
-            operator.wait_until(ready, PATIENCE)
-            before = progress()
-            if before[1] + refused > TRIES:
-                raise StageError(f"{plan.name} was stopped {before[1]} times; see {here.log(name)}")
-            if process.poll() is None:
-                client.call("reset", seed=index + done + before[0], **(plan.start or {}))
-                operator.arm()
-                if not moves(before):
-                    refused += 1
-                    continue
-                wait_for_end(before)
-    except AssertionError as error:
-        raise StageError(f"bridge.manoeuvre of {plan.name} does not go on ({error}); see {here.log(name)}") from None
-    code = process.wait(PATIENCE)
-    if code:
-        raise StageError(f"bridge.manoeuvre of {plan.name} ended with {code}: {last_line(here.log(name))}; see "
-                         f"{here.log(name)}")
 
 
 def recorded(dataset: Path, plan: Plan) -> int:

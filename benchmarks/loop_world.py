@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.plant.base import TICK
 from benchmarks.plant.draw import draw_effect
-from benchmarks.plant.make import plan
+from benchmarks.plant.make import Experiment, plan
 from benchmarks.plant.online import OnlinePlant
 from bridge.simulate import MovedSimulator
 
@@ -22,7 +22,7 @@ class PlantMover:
     """A contact plant of one day; each episode is a trial of its own."""
 
     def __init__(self, seed: int, draw: int | None) -> None:
-        setting, _ = plan({} if draw is None else draw_effect(draw), seed, 1.0, True)
+        setting, _ = plan(Experiment({} if draw is None else draw_effect(draw), seed, 1.0, True))
         self._plant = OnlinePlant(setting)
         self._episode = -1
         self.odometry = np.zeros(5)

@@ -23,6 +23,7 @@ from sysid.missing.drives import Drives, make_drives
 from sysid.missing.pose_fit import fit_poses
 from sysid.missing.reference import make_reference
 from sysid.replay.models import gyro_effects, with_effects
+from sysid.replay.records import FreeVehicle
 from sysid.replay.rollout import predictions, vehicle_plant
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import describe, set_values
@@ -55,7 +56,7 @@ class Bench:
         space = make_space(params, self.log.spec, names)
         held = np.array([base_values(params)[name] for name in self.training.names])
         spread = np.zeros((space.size, space.size))
-        u = fit_poses(self.training, self.log.training, space, held, spread, ITERATIONS)
+        u = fit_poses(self.training, space, held, spread, ITERATIONS)
         return params if u is None else set_values(params, names, jnp.asarray(space.to_values(u)))
 
     def predicted(self, params: Any) -> list[Prediction]:
@@ -71,11 +72,11 @@ def make_bench(log: Log, physics_dt: float, iterations: int) -> Bench:
     start = with_effects(preset_params(log.spec, "physical"), ("turn_efficiency", *gyro_effects(log.training)))
     base = tuple(name for name in describe(start) if name not in FIXED)
     full = with_effects(start, tuple(STARTS))
-    reference = make_reference(plant, full, (log,), False, iterations, base,
+    reference = make_reference(FreeVehicle(plant, full, base), (log,), False, iterations,
                                lambda _, text: print(f"  {text}", flush=True))
     names = tuple(base_values(full))
-    training = make_drives(plant, full, names, log.training, reference.width)
-    held_out = make_drives(plant, full, names, log.held_out, reference.width, training.paths)
+    training = make_drives(FreeVehicle(plant, full, names), log.training, reference.width)
+    held_out = training.of(log.held_out, plant.dt)
     return Bench(log, reference.params, base, training, held_out)
 
 

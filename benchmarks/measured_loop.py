@@ -45,8 +45,10 @@ from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import no_wander
 from sysid.missing.drives import make_drives
+from sysid.missing.fit_statistics import FittedVehicle
 from sysid.pages.loop_report import base_table, effects, replay
 from sysid.replay.models import with_effects
+from sysid.replay.records import FreeVehicle
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.floor import floor_change
 from sysid.verdict.late_pose import NAME, yaw_rates
@@ -202,7 +204,8 @@ def climb(settings: Benchmark, name: str, log: Log) -> list[dict[str, Any]]:
     loops: list[dict[str, Any]] = []
     for number in range(settings.rounds):
         stem = f"{name}_{number + 1}"
-        loops.append(one_loop(settings, stem, log, config_of(settings, start), start=start))
+        loops.append(one_loop(settings, stem, log, config_of(settings, start),
+                              vehicle=FittedVehicle(start, kept=False)))
         if loops[-1]["verdict"] != "named":
             break
         start = load_vehicle(settings.out / f"{stem}.toml")[1]
@@ -361,7 +364,7 @@ def halves(settings: Benchmark) -> None:
     loops = []
     for cut in settings.cuts:
         first, other = (replace(log, trials=tuple(half)) for half in cut_at(log.trials, cut))
-        given = {"references": (first,), "start": floor_start(settings, first)}
+        given = {"references": (first,), "vehicle": FittedVehicle(floor_start(settings, first), kept=False)}
         loops.append(one_loop(settings, f"half_{cut}", other, change_config(settings), False, **given))
     report(loops)
     named = [loop["verdict"] == "named" or bool(loop["floor"] and loop["floor"]["name"]) for loop in loops]
@@ -385,11 +388,11 @@ def asphalt_vehicle(settings: Benchmark) -> Prepared:
     """The vehicle of the asphalt run, whose blocks show how far it wanders, ready for the other runs; without effects
     to look for."""
     config, asphalt = change_config(settings), run_log(settings, RUNS[0])
-    reference = reference_for(asphalt, (asphalt,), config, progress=lambda _, text: print(f"  {text}", flush=True),
-                              start=floor_start(settings, asphalt))
+    reference = reference_for(asphalt, (asphalt,), config, FittedVehicle(floor_start(settings, asphalt), kept=False),
+                              lambda _, text: print(f"  {text}", flush=True))
     plant, vehicle = vehicle_plant(asphalt.spec, VehicleConfig(physics_dt=config.physics_dt)), reference.params
     names = tuple(base_values(vehicle))
-    drives = make_drives(plant, vehicle, names, asphalt.training, reference.width, gyro=reference.gyro)
+    drives = make_drives(FreeVehicle(plant, vehicle, names), asphalt.training, reference.width, gyro=reference.gyro)
     return Prepared(reference, plant, (), vehicle, names, drives.paths, no_wander(()))
 
 
@@ -491,7 +494,7 @@ def mrclam(settings: Benchmark) -> None:
         start = set_values(preset_params(log.spec, "physical"), ["command_delay.delay"], jnp.zeros(1))
         config = LoopConfig(physics_dt=settings.physics_dt, held=("command_delay.delay",))
         loop = one_loop(settings, f"mrclam_{robot}", thin(log, settings.robot_windows), config, False,
-                        start=start)
+                        vehicle=FittedVehicle(start, kept=False))
         report([loop])
         false.append(float(is_false(loop, fastest)))
         delays.append(float(any(TIMES & {one["name"], *one["class"]} for one in loop["effects"])))

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,7 @@ def judge(config: Benchmark) -> None:
     loop = LoopConfig(quick=config.quick)
     spec, vehicle = load_fitted(fitted)
     days = [of_file(day, spec, str(fitted)) for day in days]
-    reference = reference_for(days[0], days, loop, start=vehicle.params)
+    reference = reference_for(days[0], days, loop, replace(vehicle, kept=False))
     ready = prepare(reference, days[0].spec, loop)
     print(f"reference, {time.perf_counter() - began:.0f} s", flush=True)
     names = (*TESTED, *(f"null_{k + 1}" for k in range(config.nulls)))

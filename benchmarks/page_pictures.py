@@ -1,9 +1,10 @@
-"""Pictures of the tutorials and concepts, which go to docs/images:
+"""Pictures of README, the tutorials and the concepts, which go to docs/images:
 
     python -m benchmarks.page_pictures concepts            frames, drive, statistics of naming
     python -m benchmarks.page_pictures tutorials FOLDER    from what the tutorials left in FOLDER, where
                                                            `python -m benchmarks.tutorials run --out FOLDER` ran them
-    python -m benchmarks.page_pictures training RUN        curve, drives and prediction of a whole training
+    python -m benchmarks.page_pictures training RUN        drives.png of README: the drives of the final evaluation
+                                                           of a training, with legend and scale, as the run drew them
 
 The pictures of the tasks are drawn by `benchmarks.task_pages`, the others by `benchmarks.pictures`.
 """
@@ -241,15 +242,6 @@ def reduced(source: Path, out: Path, box: tuple[int, int, int, int] | None = Non
     print(f"{out}: {picture.width} x {picture.height}, {out.stat().st_size / 1e3:.0f} kB")
 
 
-def film(source: Path, out: Path) -> None:
-    """A GIF as an animated WebP."""
-    import imageio.v3 as iio
-
-    pictures = [np.asarray(frame)[..., :3] for frame in iio.imread(source)]
-    write_film(out, pictures)
-    print(f"{out}: {len(pictures)} frames, {out.stat().st_size / 1e3:.0f} kB")
-
-
 def main() -> None:
     """Draw what the command line names."""
     import matplotlib
@@ -263,7 +255,7 @@ def main() -> None:
     kinds = parser.add_subparsers(dest="kind", required=True)
     kinds.add_parser("concepts", help="frames, drive, naming")
     kinds.add_parser("tutorials", help="pictures of the tutorials").add_argument("folder", type=Path)
-    kinds.add_parser("training", help="pictures of a training").add_argument("run", type=Path)
+    kinds.add_parser("training", help="the drives of a training").add_argument("run", type=Path, metavar="RUN")
     given = parser.parse_args()
     if given.kind == "concepts":
         frames(IMAGES / "concept_frames.png")
@@ -279,9 +271,10 @@ def main() -> None:
                 print(f"{source} is not there; its picture stays as it is")
         worlds(named_task(f"{given.folder / 'parking.py'}:Parking"), IMAGES / "tutorial_parking.png")
     else:
-        reduced(given.run / "reward_curve.png", IMAGES / "tutorial_curve.png")
-        reduced(given.run / "drives.png", IMAGES / "tutorial_drives.png")
-        film(given.run / "prediction.gif", IMAGES / "tutorial_prediction.webp")
+        source = given.run / "drives.png"
+        if not source.is_file():
+            raise FileNotFoundError(f"RUN {given.run}: has no drives.png. Give the folder of a whole training.")
+        reduced(source, IMAGES / "drives.png")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
     drive      drive.webp: a planner drives the obstacle course; camera picture beside the world from above
     loop RUN   missing_effect.png: a verdict of `sysid.close_loop`, from RUN/report.json
+    verdict FILE   verdict.svg: how a verdict was reached, from an evidence.json
     ros        ros2.png: which node publishes which topic
     map        map.png: a made map from above, and what a camera sees of its walls
 
@@ -26,6 +27,7 @@ import numpy as np
 
 from bridge.options import Parser
 from whill_mjx.io.command_line import guarded
+from whill_mjx.logs.dataset import write_text
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 CAMERA = 288
@@ -63,7 +65,7 @@ def _drive(seed: int) -> list[np.ndarray]:
     def pictures(state: Any, path: Any) -> tuple[Any, Any, Any]:
         position, rotation = camera_pose(env.model, state.vehicle.qpos)
         lens = pinhole(env.model.spec.camera.fov_y, CAMERA, CAMERA)
-        seen = render(position, rotation, lens, state.scene, CAMERA, CAMERA, best)
+        seen = render(position, rotation, lens, state.scene, best)
         return seen, observe(env, state), top_view(large, state, path)
 
     @jax.jit
@@ -220,8 +222,8 @@ def office(out: Path) -> None:
     def view(key: jax.Array) -> jax.Array:
         scene, start = map_scene_sampler(made)(key)
         position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], 0.1, 0.0)
-        scene = shown(scene, position, rotation, lens, 234)
-        return render(position, rotation, lens, scene, 176, 234, Quality(antialias=True))
+        scene = shown(scene, position, rotation, lens)
+        return render(position, rotation, lens, scene, Quality(antialias=True))
 
     views = [np.asarray(view(jax.random.key(seed)))[..., ::-1] for seed in (0, 1, 2)]
     column_of = np.concatenate([np.pad(one, ((0, 11), (12, 0), (0, 0)), constant_values=255) for one in views])
@@ -239,6 +241,7 @@ def main() -> None:
     kinds = parser.add_subparsers(dest="kind", required=True)
     kinds.add_parser("drive", help="the moving picture")
     kinds.add_parser("loop", help="a named effect").add_argument("run", type=Path, help="folder with report.json")
+    kinds.add_parser("verdict", help="how it was reached").add_argument("file", type=Path, help="evidence.json")
     kinds.add_parser("ros", help="nodes and topics")
     kinds.add_parser("map", help="a map and its walls")
     given = parser.parse_args()
@@ -248,6 +251,11 @@ def main() -> None:
         drive(IMAGES / "drive.webp")
     elif given.kind == "loop":
         loop(given.run, IMAGES / "missing_effect.png")
+    elif given.kind == "verdict":
+        from sysid.pages.verdict_picture import account, draw
+        from sysid.verdict.posterior import Thresholds, read
+
+        write_text(IMAGES / "verdict.svg", draw(account(read(given.file), Thresholds())) + "\n")
     else:
         ros(IMAGES / "ros2.png")
 

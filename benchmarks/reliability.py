@@ -2,7 +2,7 @@
 
     python -m benchmarks.reliability --parts files --rooms sysid  # half an hour of one core; bridge: several hours
     python -m benchmarks.reliability --parts options              # minutes
-    python -m benchmarks.reliability --parts alone kills --commands fit --kills 10 --seed 1  # 15 minutes on two cores
+    python -m benchmarks.reliability --parts alone kills --commands fit --kills 10 --seed 1  # 20 minutes on two cores
     python -m benchmarks.reliability --parts ctrl_c               # an hour
 
 Damaged files and mistaken commands are those of the tests, more of them. Kills and Ctrl-C meet the commands as users
@@ -49,12 +49,12 @@ ROOT = Path(__file__).parents[1]
 PARTS = ("files", "options", "alone", "kills", "ctrl_c")
 CHAIR = "sysid/data/chair"
 COMMANDS = {
-    "fit": ["sysid.fit", CHAIR, "--starts", "5"],
-    "close_loop": ["sysid.close_loop", CHAIR, "--refit-nulls", "5"],
-    "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "60000",
+    "fit": ["sysid.fit", CHAIR, "--starts", "4"],
+    "close_loop": ["sysid.close_loop", CHAIR, "--refit-nulls", "2"],
+    "train": ["whill_mjx.train", "--preset", "smoke", "--vehicle", "whill_cr_ramp", "--steps", "50000",
               "--episodes", "2", "--no-planner", "--videos", "0", "--checkpoint-every-s", "20"],
 }  # fmt: skip
-"""Runs of five to ten minutes on two cores: one that is killed ten times and then ends takes a quarter of an hour."""
+"""Runs of five to eight minutes on two cores: one that is killed ten times and then ends takes twelve minutes."""
 QUICK = {
     "fit": ["sysid.fit", CHAIR, "--quick"],
     "close_loop": ["sysid.close_loop", CHAIR, "--quick"],

@@ -88,8 +88,8 @@ def train(options: Options, folder: Path, seed: int, words: list[str], over: Cal
 
 def _told(folder: Path) -> dict[str, str]:
     """The environment of a process that keeps its programs in `folder`."""
-    told = {FOLDER.upper(): str(folder / "compiled"), LEAST_S.upper(): str(KEPT_S), "PYTHONUNBUFFERED": "1"}
-    return {**GIVEN, **told}
+    kept = {FOLDER.upper(): str(folder / "compiled"), LEAST_S.upper(): str(KEPT_S), "PYTHONUNBUFFERED": "1"}
+    return {**GIVEN, **kept}
 
 
 def first_step(out: Path, line: str) -> bool:

@@ -193,8 +193,8 @@ def worlds(task: Task, out: Path) -> None:
         state = reset_state(env, params, key)
         position, rotation = camera_pose(env.model, state.vehicle.qpos)
         lens = pinhole(env.model.spec.camera.fov_y, 240, 240)
-        scene = shown(state.scene, position, rotation, lens, 240)
-        seen = render(position, rotation, lens, scene, 240, 240, Quality(antialias=True, shadows=True))
+        scene = shown(state.scene, position, rotation, lens)
+        seen = render(position, rotation, lens, scene, Quality(antialias=True, shadows=True))
         return seen, top_view(env, state), state.scene.marker.position[:2]
 
     chosen: list[np.ndarray] = []  # their goal is in the view from above

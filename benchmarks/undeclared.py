@@ -29,6 +29,7 @@ from benchmarks import undeclared_plant as contact
 from benchmarks.harness import RESULTS, device_name, provenance
 from benchmarks.undeclared_reference import Driven, prepared, reference_days, reference_of
 from sysid.logs.log import load_log
+from sysid.missing.catalogue import Hypothesis
 from sysid.pages.loop_report import make_report, write_run
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.pipeline import find_missing
@@ -54,8 +55,8 @@ class Benchmark:
     nulls: Annotated[int, NOT_NEGATIVE] = 0
     """Logs of the contact plant with nothing in them."""
     reference_sets: Annotated[int, COUNT] = 1
-    """Sets of reference days that these are judged against in turn; all else is judged against the first. With as many
-    sets as there are processes (`part`), each makes one."""
+    """Sets of reference days that these and `noisy_nulls` are judged against in turn; all else is judged against the
+    first. With as many sets as there are processes (`part`), each makes one."""
     own_sets: Annotated[int, NOT_NEGATIVE] = 0
     """Further logs with nothing in them, each judged against a set of its own: their p-values are independent."""
     base: bool = False
@@ -81,7 +82,7 @@ class Benchmark:
     only: tuple[str, ...] = ()
     """Only logs with these effects, of those from `base` and `scales`."""
     labels: tuple[str, ...] = ()
-    """Only logs of these names, of all that the other options ask for."""
+    """Only logs of these names, in this order, of all that the other options ask for."""
     full: Annotated[int, COUNT] = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -162,10 +163,8 @@ def plant(settings: Benchmark) -> None:
 
     def judge(listed: Sequence[contact.Job]) -> None:
         for number, job in enumerate(listed):
-            if settings.labels and job.label not in settings.labels or (
-                    work / "verdicts" / f"{job.label}.json").exists():
-                continue
-            if settings.share and not contact.claimed(work, job.label):
+            if (work / "verdicts" / f"{job.label}.json").exists() or (
+                    settings.share and not contact.claimed(work, job.label)):
                 continue
             if job.reference not in ready:
                 ready.clear()  # one at a time: each has its compiled replay
@@ -175,23 +174,30 @@ def plant(settings: Benchmark) -> None:
             print(job.label, one["verdict"], [effect["class"] for effect in one["effects"]], f"{one['share']:.2f}",
                   f"p {one['p_value']:.2g}", f"{one['seconds']:.0f} s", flush=True)
 
-    nulls = contact.null_jobs(settings.nulls, part, settings.reference_sets)
-    judge(sorted(nulls, key=lambda job: job.reference))
-    judge(contact.own_set_jobs(settings.own_sets, part))
     while settings.base and (listed := contact.probe_jobs(work, part, settings.only)):
         judge(listed)
+    judge(wanted(settings))
+    if part == "1/1" and not settings.share:
+        undeclared_figures.figures(work, driven)
+
+
+def wanted(settings: Benchmark) -> list[contact.Job]:
+    """The logs that were asked for, in the order in which they are judged."""
+    work, part, driven = settings.work / "plant", settings.part, settings.driven
+    nulls = contact.null_jobs(settings.nulls, part, settings.reference_sets)
+    listed = sorted(nulls, key=lambda job: job.reference) + contact.own_set_jobs(settings.own_sets, part)
     if settings.scales:
-        judge(contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only))
+        listed += contact.scaled_jobs(work, settings.scales, settings.seeds, part, driven, settings.only)
     if settings.sensor_noise:
         usual = contact.scaled_jobs(work, (4.0,), settings.seeds, "1/1", driven, settings.only)
         usual += contact.pair_jobs(work, settings.noisy_pairs, "1/1", driven)
-        judge(contact.noisy_jobs(usual, settings.sensor_noise, settings.noisy_nulls, part))
+        listed += contact.noisy_jobs(usual, settings.sensor_noise, settings.noisy_nulls, part,
+                                     settings.reference_sets)
     if settings.left_out:
-        judge(contact.left_out_jobs(work, part))
-    if settings.pairs:
-        judge(contact.pair_jobs(work, settings.pairs, part, driven))
-    if part == "1/1" and not settings.share:
-        undeclared_figures.figures(work, driven)
+        listed += contact.left_out_jobs(work, part)
+    listed += contact.pair_jobs(work, settings.pairs, part, driven)
+    by_name = {job.label: job for job in listed}
+    return [by_name[label] for label in settings.labels if label in by_name] if settings.labels else listed
 
 
 def look_alikes(settings: Benchmark) -> None:
@@ -199,7 +205,8 @@ def look_alikes(settings: Benchmark) -> None:
     from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
     from sysid.missing.drives import make_drives
     from sysid.missing.signatures import gather
-    from sysid.verdict.classes import classes, imitation
+    from sysid.replay.records import FreeVehicle
+    from sysid.verdict.classes import imitation
 
     days = reference_days(settings.work / "plant")
     content: dict[str, Any] = {"threshold": 0.9, "command": "python -m benchmarks.undeclared --classes", "sensors": {}}
@@ -211,13 +218,29 @@ def look_alikes(settings: Benchmark) -> None:
         full = with_catalogue(reference.params, found)
         base = base_values(full)
         plant = vehicle_plant(logs[0].spec, VehicleConfig())
-        drives = make_drives(plant, full, tuple(base), logs[0].training)
+        drives = make_drives(FreeVehicle(plant, full, tuple(base)), logs[0].training)
         at = drives.simulate(np.array([list(base.values())]))[0]
         evidence, _ = gather(drives.weighted(at, reference.factors, logs[0].spec.track), reference, found, full)
         members = classes(imitation(evidence, found), found)
         content["sensors"][sensors] = {"classes": members,
                                        "mean_size": float(np.mean([len(each) for each in members.values()]))}
     write_json(undeclared_figures.CLASSES, content)
+
+
+def classes(
+    alike: np.ndarray, hypotheses: Sequence[Hypothesis], threshold: float = 0.9, largest: int = 4
+) -> dict[str, list[str]]:
+    """Effect -> itself and the effects that imitate it, nearest first."""
+    out: dict[str, list[str]] = {}
+    for effect in dict.fromkeys(one.effect for one in hypotheses):
+        mine = [i for i, one in enumerate(hypotheses) if one.effect == effect]
+        nearest: dict[str, float] = {}
+        for i in mine:
+            for j, other in enumerate(hypotheses):
+                if other.effect != effect and alike[i, j] > threshold:
+                    nearest[other.effect] = max(nearest.get(other.effect, 0.0), float(alike[i, j]))
+        out[effect] = [effect, *sorted(nearest, key=lambda name: -nearest[name])][:largest]
+    return out
 
 
 def write_json(path: Path, content: Any) -> None:

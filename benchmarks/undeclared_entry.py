@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from benchmarks.plant.effects import EFFECTS
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
 from benchmarks.undeclared_methods import Method, Verdict, check_verdict, find_method
 from benchmarks.undeclared_plant import RECORDED, capped
 from sysid.intervals.statistics import upper_rate
@@ -178,8 +178,8 @@ def table(found: Mapping[str, Mapping[str, Any]]) -> str:
 def _driven(folder: Path, effects: Mapping[str, float], seed: int, options: Entry) -> Path:
     """The log of these effects; what was in it is nowhere in the folder."""
     if not folder.exists():
-        make_log(folder, effects=effects, seed=seed, manoeuvres=options.manoeuvres or None,
-                 replicates=options.replicates)
+        make_log(folder, Experiment(effects=effects, seed=seed, manoeuvres=options.manoeuvres or None,
+                 replicates=options.replicates))
     return folder
 
 

@@ -21,6 +21,7 @@ from sysid.intervals.statistics import upper_rate
 from sysid.pages.report import write_report
 from sysid.verdict import posterior as decision
 from sysid.verdict.posterior import Thresholds, from_json, posterior
+from whill_mjx.evaluation.intervals import wilson_interval
 
 LEAST = 30
 """Logs with nothing in them on which p-values are calibrated at least."""
@@ -104,6 +105,12 @@ def read_cases(work: Path) -> Iterable[Case]:
         yield json.loads((work / "truth" / path.name).read_text()), json.loads(path.read_text())
 
 
+def share(hits: Sequence[bool], unit: str) -> dict[str, Any]:
+    """A share with its 95 % interval (`low`, `high`) and number `n`."""
+    low, high = wilson_interval(int(sum(hits)), len(hits))
+    return {**figure([float(np.mean(hits))], unit), "low": low, "high": high, "n": len(hits)}
+
+
 def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """False alarms and whether p-values are uniform."""
     from scipy import stats
@@ -112,7 +119,8 @@ def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
         return {}
     false = sum(one["verdict"] != "none" for one in nulls)
     found = {
-        "false_alarms": figure([float(false)], f"of {len(nulls)} logs with nothing in them"),
+        "false_alarms": {**figure([float(false)], f"of {len(nulls)} logs with nothing in them"), "n": len(nulls),
+                         "sets": sets_of(nulls)},
         "false_alarm_upper": figure([upper_rate(false, len(nulls))], "share")}
     apart = [one for one in nulls if not calibrates(one)]
     for name, p_of in (("null_ks_p", calibrated), ("null_ks_p_uncalibrated", float)):
@@ -132,7 +140,8 @@ def of_noisy(cases: Sequence[Case]) -> dict[str, Any]:
         if nulls:
             false = sum(one["verdict"] != "none" for one in nulls)
             about = f"logs with nothing in them at {level:g} times the noise of the reference days"
-            found[f"false_alarms{tag}"] = figure([float(false)], f"of {len(nulls)} {about}")
+            found[f"false_alarms{tag}"] = {**figure([float(false)], f"of {len(nulls)} {about}"), "n": len(nulls),
+                                           "sets": sets_of(nulls)}
             found[f"false_alarm_upper{tag}"] = figure([upper_rate(false, len(nulls))], f"share of {about}")
             inside = [each["interval"][0] <= level <= each["interval"][1]
                       for one in nulls for each in one["noise_levels"].values()]
@@ -184,19 +193,19 @@ def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[s
         about = f"share of {len(known)} logs"
         right = [said(name, one) for name, one in known]
         wrong = [one["verdict"] == "named" and not ok for (_, one), ok in zip(known, right, strict=True)]
-        found[f"class_accuracy{tag}"] = figure([float(np.mean(right))], about)
+        found[f"class_accuracy{tag}"] = share(right, about)
         right_ones = [one for (_, one), ok in zip(known, right, strict=True) if ok]
         if right_ones:
-            found[f"warned_right{tag}"] = figure([float(np.mean([warned(one) for one in right_ones]))],
-                                                 f"share of {len(right_ones)} right names that come with a warning")
-        found[f"wrong_name{tag}"] = figure([float(np.mean(wrong))], about)
-        found[f"noticed{tag}"] = figure([float(np.mean([one["verdict"] != "none" for _, one in known]))], about)
+            found[f"warned_right{tag}"] = share([warned(one) for one in right_ones],
+                                                f"share of {len(right_ones)} right names that come with a warning")
+        found[f"wrong_name{tag}"] = share(wrong, about)
+        found[f"noticed{tag}"] = share([one["verdict"] != "none" for _, one in known], about)
         sizes = [len(effect["class"]) for _, one in known for effect in one["effects"]]
         if sizes:
             found[f"mean_class_size{tag}"] = figure([float(np.mean(sizes))], "effects")
     if beyond:
-        found[f"out_of_catalogue{tag}"] = figure(
-            [float(np.mean([one["verdict"] == "unexplained" for one in beyond]))],
+        found[f"out_of_catalogue{tag}"] = share(
+            [one["verdict"] == "unexplained" for one in beyond],
             f"share of {len(beyond)} logs that are said to be unexplained")
     return found
 
@@ -211,8 +220,8 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
         return {}
     both = [all(said(name, one) for name in truth) for truth, one in pairs]
     clean = [all(set(effect["class"]) & set(truth) for effect in one["effects"]) for truth, one in pairs]
-    return {"pair_both": figure([float(np.mean(both))], f"share of {len(pairs)} logs"),
-            "pair_wrong": figure([1 - float(np.mean(clean))], f"share of {len(pairs)} logs with a wrong name")}
+    return {"pair_both": share(both, f"share of {len(pairs)} logs"),
+            "pair_wrong": share([not one for one in clean], f"share of {len(pairs)} logs with a wrong name")}
 
 
 def warned(one: dict[str, Any]) -> bool:
@@ -243,10 +252,9 @@ def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]], own: Mapping[str, 
         for name, one in inside]
     wrong = [bad and not warned(one) for bad, (_, one) in zip(outside, inside, strict=True)]
     about = f"share of {len(inside)} logs whose effect was taken out of the catalogue"
-    return {"left_out_wrong": figure([float(np.mean(wrong))], about),
-            "left_out_outside_class": figure([float(np.mean(outside))], about),
-            "left_out_unexplained": figure([float(np.mean([one["verdict"] == "unexplained" for _, one in inside]))],
-                                           about)}
+    return {"left_out_wrong": share(wrong, about),
+            "left_out_outside_class": share(outside, about),
+            "left_out_unexplained": share([one["verdict"] == "unexplained" for _, one in inside], about)}
 
 
 def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
@@ -257,11 +265,11 @@ def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
             if effect["name"] in truth and effect["name"] in SAME and effect["parameters"]:
                 parameter, neutral, unit = SAME[effect["name"]]
                 driven, seen = neutral + unit * truth[effect["name"]], effect["parameters"][parameter]
-                inside.append(float(seen["interval"][0] <= driven <= seen["interval"][1]))
+                inside.append(seen["interval"][0] <= driven <= seen["interval"][1])
                 errors.append(abs(seen["value"] - driven) / abs(driven - neutral))
     if not inside:
         return {}
-    return {"interval_coverage": figure([float(np.mean(inside))], f"share of {len(inside)} 95 % intervals"),
+    return {"interval_coverage": share(inside, f"share of {len(inside)} 95 % intervals"),
             "parameter_error": figure(errors, "of the size")}
 
 

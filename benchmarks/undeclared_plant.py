@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.harness import RESULTS, device_name
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.effects import EFFECTS, in_proportion
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
 from benchmarks.undeclared_reference import USUAL, Driven, reference_days
 from sysid.follow_up.trust import warnings
 from sysid.logs.log import load_log
@@ -112,11 +112,11 @@ def own_set_jobs(count: int, part: str) -> list[Job]:
     return [Job(f"null_own_{n:03d}", {}, OWN_SEED + n, reference=OWN_SET + n) for n in range(count) if mine(n, part)]
 
 
-def noisy_jobs(usual: Sequence[Job], levels: Sequence[float], nulls: int, part: str) -> list[Job]:
-    """Logs noisier or quieter than the reference days: with nothing in them, and those of other jobs (`scaled_jobs`,
-    `pair_jobs`) driven anew. They are mixed, so that a part of them is a fair part."""
+def noisy_jobs(usual: Sequence[Job], levels: Sequence[float], nulls: int, part: str, sets: int = 1) -> list[Job]:
+    """Logs noisier or quieter than the reference days: with nothing in them, dealt over sets of these days, and those
+    of other jobs (`scaled_jobs`, `pair_jobs`) driven anew. They are mixed, so that a part of them is a fair part."""
     listed = [(n / nulls, Job(f"noise_{level:g}_{n:03d}", {}, 20000 + n + round(1000 * (level - 1)), stage="noisy",
-                              noise=level))
+                              noise=level, reference=n % sets))
               for n in range(nulls) for level in levels]
     listed += [(n / len(usual), replace(job, label=f"{job.label}_noise_{level:g}", seed=job.seed + 4000,
                                         stage="noisy", noise=level))
@@ -270,7 +270,8 @@ def judge(
         return json.loads(verdict.read_text())
     folder = work / "logs" / (job.log or job.label)
     if not folder.exists():
-        make_log(folder, effects=job.effects, seed=job.seed, noise=driven.noise * job.noise, vehicle=driven.vehicle)
+        make_log(folder, Experiment(effects=job.effects, seed=job.seed, noise=driven.noise * job.noise,
+                 vehicle=driven.vehicle))
     began = time.perf_counter()
     config = replace(config, without=job.without)
     result = find_missing(load_log(folder), (), config, reference=ready)
@@ -317,7 +318,7 @@ def speed(work: Path, refit_nulls: int = 0) -> None:
     reference_days(work)
     log = work / "logs" / "speed"
     if not log.exists():
-        make_log(log, effects={"slope": EFFECTS["slope"].base}, seed=70000)
+        make_log(log, Experiment(effects={"slope": EFFECTS["slope"].base}, seed=70000))
     days, out = sorted((work / "reference").glob("day_*")), work / f"speed_{refit_nulls}"
     command = [sys.executable, "-m", "sysid.close_loop", log, "--reference", *days, "--out", out, "--refit-nulls",
                refit_nulls]

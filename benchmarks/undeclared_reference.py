@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import kept
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
+from sysid.errors.space import make_space
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
 from sysid.missing.days import Reference
 from sysid.missing.reference import make_reference
 from sysid.pages.report import code_hashes
+from sysid.replay.records import FreeVehicle
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.preparation import prepare
 from sysid.verdict.result import LoopConfig, Prepared
@@ -72,8 +74,8 @@ def reference_days(work: Path, driven: Driven = USUAL, number: int = 0) -> list[
         path = folder_of(work, number) / f"day_{day + 1}"
         if not path.exists():
             try:
-                make_log(path, seed=FIRST_SEED + SEEDS * number + day, noise=driven.noise,
-                         replicates=3 if day == 0 else 1, vehicle=driven.vehicle)
+                make_log(path, Experiment(seed=FIRST_SEED + SEEDS * number + day, noise=driven.noise,
+                         replicates=3 if day == 0 else 1, vehicle=driven.vehicle))
             except OSError:
                 if not path.exists():  # else another part was quicker
                     raise
@@ -84,8 +86,9 @@ def reference_days(work: Path, driven: Driven = USUAL, number: int = 0) -> list[
 def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
     """The reference, made once for all logs of one vehicle."""
     plant = vehicle_plant(logs[0].spec, VehicleConfig(physics_dt=config.physics_dt))
-    return make_reference(plant, preset_params(logs[0].spec, config.preset), logs, True, config.iterations,
-                          progress=lambda _, remark: print(remark, flush=True))
+    params = preset_params(logs[0].spec, config.preset)
+    return make_reference(FreeVehicle(plant, params, make_space(params, logs[0].spec).names), logs, True,
+                          config.iterations, lambda _, remark: print(remark, flush=True))
 
 
 def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Prepared:

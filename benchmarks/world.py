@@ -60,20 +60,20 @@ def wrong_share(path: Path, poses: int) -> float:
     segments = jnp.asarray(made.walls.segments)
     lens = pinhole(1.0, 64, 64)
     pitch = 0.1
-    horizon = dataclasses.replace(lens, cy=0.5 + jnp.tan(pitch) * lens.fy)  # an image of one row: the horizon
+    horizon = dataclasses.replace(lens, cy=0.5 + jnp.tan(pitch) * lens.fy, height=1)  # one row: the horizon
 
     def wrong(start):
         position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], pitch, 0.0)
 
         def depth(image):
-            return render_frame(position, rotation, horizon, image, 1, 64).depth
+            return render_frame(position, rotation, horizon, image).depth
 
         right = jnp.full((1, 64), jnp.inf)
         for first in range(0, len(segments), MOST):
             index = jnp.arange(first, min(first + MOST, len(segments)))
             part = wall_boxes(segments, index, jnp.ones(index.shape, bool), made.walls.height, (0.8, 0.8, 0.7))
             right = jnp.minimum(right, depth(dataclasses.replace(scene, boxes=part, walls=None)))
-        seen = depth(shown(scene, position, rotation, lens, 64))
+        seen = depth(shown(scene, position, rotation, lens))
         return jnp.mean((jnp.abs(seen - right) > 0.5) | (jnp.isfinite(seen) != jnp.isfinite(right)))
 
     rng = np.random.default_rng(0)

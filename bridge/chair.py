@@ -13,6 +13,7 @@ import time
 from typing import Any
 
 from bridge import ros
+from bridge.exits import Exit
 from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
 from bridge.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
 
@@ -70,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
         ros.spin(node)
         if chair.odometry.gaps:
             print(f"bridge.chair: {chair.odometry.gaps} gaps above 2 s in which the pose stood still", file=sys.stderr)
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bridge import ros
+from bridge.exits import Exit
 from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
 from bridge.whill import COMMAND_EXPIRY
 
@@ -122,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
             for _ in range(3):
                 joy.publish(0.0, 0.0)
                 time.sleep(0.02)
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

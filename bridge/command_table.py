@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from bridge.exits import OptionError
+
 STANDSTILL = 1.0
 """Seconds of standstill that a recorded drive needs before and after its motion."""
 PERIOD = 0.05
@@ -146,15 +148,15 @@ def make_table(rows: np.ndarray, low: tuple[float, float], high: tuple[float, fl
         name: what errors call the commands.
 
     Raises:
-        ValueError: a command is beyond the limits: it is refused, not cut, because a cut manoeuvre is another one.
+        OptionError: a command is beyond the limits: it is refused, not cut, because a cut manoeuvre is another one.
     """
     for column, unit in ((1, "m/s"), (2, "rad/s")):
         values = rows[:, column]
         a, b = low[column - 1], high[column - 1]
         worst = values[np.argmax(np.maximum(values - b, a - values))]
         if not a <= worst <= b:
-            raise ValueError(f"{name}: {COLUMNS[column]} {worst:g} {unit} is not within {a:g} to {b:g} {unit}, the "
-                             "limits of base and command line. Drive a slower manoeuvre, or widen the limits.")
+            raise OptionError(f"{name}: {COLUMNS[column]} {worst:g} {unit} is not within {a:g} to {b:g} {unit}, the "
+                              "limits of base and command line. Drive a slower manoeuvre, or widen the limits.")
     times = np.arange(0.0, rows[-1, 0] - rows[0, 0] + PERIOD, PERIOD) + rows[0, 0]
     held = np.searchsorted(rows[:, 0], times + 1e-9, side="right") - 1
     still = np.zeros(round(STANDSTILL / PERIOD))
@@ -209,7 +211,7 @@ def check_space(reach: Reach, space: tuple[float, float]) -> str:
     """Return where to put the vehicle on a free floor of length and width [m].
 
     Raises:
-        ValueError: the floor is too small either way round.
+        OptionError: the floor is too small either way round.
     """
     length, width = space
     if reach.length <= length and reach.width <= width:
@@ -217,9 +219,9 @@ def check_space(reach: Reach, space: tuple[float, float]) -> str:
     elif reach.length <= width and reach.width <= length:
         along, x, y = "WIDTH", width - reach.length, length - reach.width
     else:
-        raise ValueError(f"the manoeuvre needs a floor of {reach.length:.1f} x {reach.width:.1f} m with its margins; "
-                         f"{length:g} x {width:g} m are free. Find more room, drive slower, or ask sysid.design for a "
-                         "manoeuvre with --space.")
+        raise OptionError(f"the manoeuvre needs a floor of {reach.length:.1f} x {reach.width:.1f} m with its margins; "
+                          f"{length:g} x {width:g} m are free. Find more room, drive slower, or ask sysid.design for a "
+                          "manoeuvre with --space.")
     return (f"Put the drive axle {reach.behind + x / 2:.1f} m from the edge behind it and {reach.left + y / 2:.1f} m "
             f"from the edge on its left, facing along the floor's {along}. The drive needs {reach.length:.1f} x "
             f"{reach.width:.1f} m, margins included, and reaches {reach.speed:.2f} m/s.")

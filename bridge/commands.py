@@ -44,6 +44,9 @@ class Ear:
     def heard(self, v: float, omega: float) -> bool:
         """Take a command from the topic; return whether another node surely sent it."""
         if (v, omega) in self._own:
+            if v == omega == 0:
+                self._own.remove((v, omega))  # it may be the guard's, and earlier ones of ours still on their way
+                return False
             while self._own.popleft() != (v, omega):
                 pass  # earlier ones were lost on the way
             return False

@@ -12,9 +12,10 @@ from typing import Literal
 
 import numpy as np
 
-from bridge.image import ImageError
+from bridge.image import ImageError, RawImage
 from bridge.policy import Policy
 from bridge.safety import Command, SafetyConfig, State, Supervisor
+from bridge.senses import PATIENCE, Senses
 from bridge.view import View
 
 BACKSTOP = 1.25
@@ -58,27 +59,28 @@ class Controller:
         self._clock = clock
         self._on_blind = on_blind
         self._pace_by_stamp = pace_by_stamp
-        self._view = view or View((policy.contract.height, policy.contract.width))
-        self._period = 1 / policy.contract.rate_hz
+        self._view = view or View(policy.pacer.size if policy.pacer.kind == "camera" else (1, 1))
+        self._period = 1 / policy.commands.rate_hz
+        self.senses = Senses(policy.sensors, policy.pacer, self._period, self.supervisor)
+        self._waiting: tuple[float, np.ndarray] | None = None
         self._due = -np.inf
         self._arrived = -np.inf
         self._sent = -np.inf
         self._last = Command(0.0, 0.0, "no frame yet")
         self._ticks = 0
-        self._uniform = 0
+        self._uniform: dict[str, int] = {}  # uniform images in a row of each camera
 
-    def on_image(self, now: float, stamp: float, stamp_age: float, height: int, width: int, encoding: str, step: int,
-                 data: object) -> Command | None:
+    def on_image(self, now: float, stamp: float, stamp_age: float, image: RawImage) -> Command | None:
         """Take one camera message; return the command to publish, None where there is none to send now.
 
         Args:
             now: steady time of receipt [s].
             stamp: stamp of the message [s].
             stamp_age: time of receipt minus stamp, on the clock that made the stamp [s].
-            height, width, encoding, step, data: the fields of sensor_msgs/Image.
+            image: the message, sensor_msgs/Image.
         """
-        self.image_bytes = height * step
-        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.raw(height, width, encoding, step, data))
+        self.image_bytes = image.height * image.step
+        return self._on_decoded(now, stamp, stamp_age, lambda: self._view.raw(image))
 
     def on_compressed(self, now: float, stamp: float, stamp_age: float, data: object) -> Command | None:
         """Take one sensor_msgs/CompressedImage, JPEG or PNG; times and result as of `on_image`."""
@@ -91,39 +93,74 @@ class Controller:
         try:
             image = decode()
         except ImageError as error:
-            self.unusable = str(error)
-            self.supervisor.counts["unusable"] += 1
+            self.refuse(str(error))
             return None
-        self.unusable = ""
         return self.on_rgb8(now, stamp, stamp_age, image)
 
     def on_rgb8(self, now: float, stamp: float, stamp_age: float, image: np.ndarray) -> Command | None:
         """Take one image (H, W, 3) uint8 of the policy's size; times and result as of `on_image`."""
-        contract, supervisor = self.policy.contract, self.supervisor
-        self.digest = zlib.crc32(image.data)
-        if supervisor.frame(now, stamp, self.digest, stamp_age) != "fresh":
+        return self.on_paced(now, stamp, stamp_age, image, zlib.crc32(image.data))
+
+    def on_paced(self, now: float, stamp: float, stamp_age: float, value: np.ndarray, digest: int) -> Command | None:
+        """Take a value of the sensor that paces the policy, with a hash of what was measured; the rest as `on_image`.
+
+        Where it has several cameras, the step waits for the images of the others, `PATIENCE` at most.
+        """
+        self.digest, self.unusable = digest, ""
+        if self.supervisor.frame(now, stamp, digest, stamp_age) != "fresh":
             return None
-        self._watch_exposure(image)
+        self.watch_exposure(self.policy.pacer.name, value)
         if not self._is_due(stamp if self._pace_by_stamp else now):
             return None  # a camera faster than the policy
+        if not self.senses.complete:
+            self._waiting = now, value
+            return None
+        return self._step(now, value)
+
+    def on_sensed(self, now: float, name: str, stamp: float, stamp_age: float, value: np.ndarray, digest: int
+                  ) -> Command | None:
+        """Take a value of another sensor; return the command of a step that waited for it alone."""
+        stream = self.senses.streams[name]
+        stream.take(now, stamp, stamp_age, value, digest, self.supervisor.is_moving)
+        self.watch_exposure(name, value)
+        self.senses.watch(now)
+        if self._waiting is None or not self.senses.complete:
+            return None
+        return self._step(now, self._waiting[1])
+
+    def refuse(self, why: str) -> None:
+        """Count a message of the pacer that could not be used."""
+        self.unusable = why
+        self.supervisor.counts["unusable"] += 1
+
+    def _step(self, now: float, value: np.ndarray) -> Command | None:
+        """Let the policy act on what its sensors show, where it may drive."""
+        supervisor, self._waiting = self.supervisor, None
         if supervisor.take_reset():
             self.policy.reset()
+            self.senses.begin()
             self._ticks = 0
         self._ticks += 1
-        if not supervisor.may_drive or (self._ticks - 1) % contract.action_repeat:
+        if not supervisor.may_drive or (self._ticks - 1) % self.policy.commands.action_repeat:
             return self._send(now, supervisor.tick(now))
         start = self._clock()
         try:
-            action = self.policy.step(image)
+            action = self.policy.step(self.senses.observation(value))
         except Exception as error:  # the runtime's own exception types all derive from Exception directly
             supervisor.counts["policy error"] += 1
             self.unusable = f"the policy failed: {error}"
             action = np.full(2, np.nan)
         self._watch_novelty()
-        return self._send(now, supervisor.action(now, action, self._clock() - start))
+        command = supervisor.action(now, action, self._clock() - start)
+        self.senses.sent(command)
+        return self._send(now, command)
 
     def on_tick(self, now: float) -> Command | None:
         """Return a command where one is due although no frame came: a stop at once, else after BACKSTOP periods."""
+        if self.senses.streams:
+            self.senses.watch(now)
+            if self._waiting is not None and now - self._waiting[0] >= PATIENCE:
+                return self._step(now, self._waiting[1])
         command = self.supervisor.tick(now)
         stops_now = command.reason != "" and self._last.reason == ""
         if stops_now or now - self._sent >= BACKSTOP * self._period:
@@ -151,16 +188,18 @@ class Controller:
         self._due = (now if abs(now - self._due) > self._period else (now + self._due) / 2) + self._period
         return True
 
-    def _watch_exposure(self, image: np.ndarray) -> None:
-        """Count runs of images that are uniformly black or saturated, and do what was asked for while they last."""
-        self._uniform = self._uniform + 1 if image.max() <= 2 or image.min() >= 253 else 0
-        if self._uniform == BLIND_FRAMES:
+    def watch_exposure(self, name: str, image: np.ndarray) -> None:
+        """Count a camera's runs of uniformly black or saturated images, and do what was asked for while they last."""
+        if image.ndim != 3:
+            return
+        runs = self._uniform
+        runs[name] = runs.get(name, 0) + 1 if image.max() <= 2 or image.min() >= 253 else 0
+        if runs[name] == BLIND_FRAMES:
             self.supervisor.counts["dark or saturated"] += 1
-        blind = self._uniform >= BLIND_FRAMES
         if self._on_blind == "stop":
-            self.supervisor.block(BLIND, blind)
+            self.supervisor.block(BLIND, self.is_blind)
         elif self._on_blind == "slow":
-            (self.supervisor.slow.add if blind else self.supervisor.slow.discard)(BLIND)
+            (self.supervisor.slow.add if self.is_blind else self.supervisor.slow.discard)(BLIND)
 
     def _watch_novelty(self) -> None:
         """Slow down, then stop for good, while the policy's surprise is larger than its own world made it."""
@@ -176,5 +215,5 @@ class Controller:
 
     @property
     def is_blind(self) -> bool:
-        """True while the camera shows one uniform black or white."""
-        return self._uniform >= BLIND_FRAMES
+        """True while a camera shows one uniform black or white."""
+        return max(self._uniform.values(), default=0) >= BLIND_FRAMES

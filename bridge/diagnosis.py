@@ -10,6 +10,7 @@ from statistics import median
 
 from bridge.commands import TYPES, Endpoint
 from bridge.ros import PROFILE, PROFILE_VARIABLES
+from bridge.senses import Stream
 
 WINDOW = 2.0
 """Seconds of frames that count."""
@@ -111,6 +112,8 @@ class Evidence:
     """Who listens to commands."""
     guard: str
     """What is wrong with the guard."""
+    sensor: str = "camera"
+    """What sends the frames; of a policy without a camera another sensor."""
     silence: float = 0.0
     """Seconds since the last frame."""
     settled: bool = True
@@ -133,6 +136,34 @@ def causes(evidence: Evidence) -> list[str]:
     return [*_camera_causes(evidence), *_frame_causes(evidence), *_command_causes(evidence)]
 
 
+def input_cause(name: str, topic: str, kind: str, publishers: list[Endpoint], stream: Stream, now: float) -> str:
+    """Return what is wrong with a sensor beside the one that paces the policy, with its remedy; empty where nothing is.
+
+    Args:
+        name: of the policy's input.
+        topic: resolved name.
+        kind: message type that is read there.
+        publishers: of the topic.
+        stream: what came.
+        now: steady time [s].
+    """
+    wrong = sorted({one.type for one in publishers} - {kind})
+    if wrong:
+        return f"{topic} carries {', '.join(wrong)}, and the policy's {name} is a {kind}: remap it to the right topic"
+    if not publishers:
+        return f"no publisher on {topic}, the policy's {name}: start the {stream.sensor.kind}, or remap the topic"
+    if now - stream.received <= SILENT and stream.unusable:
+        return f"{topic}: {stream.unusable}"
+    if stream.is_silent(now):
+        since = now - stream.received
+        return (f"{topic}: nothing came yet: check the publisher" if math.isinf(since) else
+                f"{topic}: the last {name} came {since:.1f} s ago, and it counts for {stream.limit:.2f} s: check the "
+                "publisher and its rate")
+    if stream.is_frozen:
+        return f"{topic}: {name} does not change while the vehicle moves: restart the {stream.sensor.kind}"
+    return ""
+
+
 def _camera_causes(evidence: Evidence) -> list[str]:
     """Return why frames do not come, or come from more than one source."""
     topic = evidence.image_topic
@@ -143,7 +174,8 @@ def _camera_causes(evidence: Evidence) -> list[str]:
         hint = "give --compressed for CompressedImage" if wrong == [IMAGE_TYPES[1]] else "name the camera's own topic"
         found.append(f"{topic} carries {', '.join(wrong)}, and the bridge reads {evidence.image_type}: {hint}")
     elif not evidence.cameras and not evidence.starting:
-        found.append(f"no publisher on {topic}: start the camera, or compare ROS_DOMAIN_ID and the topic name")
+        found.append(f"no publisher on {topic}: start the {evidence.sensor}, or compare ROS_DOMAIN_ID and the topic "
+                     "name")
     if len(fitting) > 1:
         names = ", ".join(sorted(camera.node for camera in fitting))
         found.append(f"{topic} has {len(fitting)} publishers ({names}): their images mix; stop or remap all but one")
@@ -164,7 +196,7 @@ def _frame_causes(evidence: Evidence) -> list[str]:
         return []
     found = []
     if evidence.silence > SILENT:
-        return [f"{topic}: the camera fell silent {evidence.silence:.1f} s ago"]
+        return [f"{topic}: the {evidence.sensor} fell silent {evidence.silence:.1f} s ago"]
     if evidence.unusable:
         found.append(f"{topic}: {evidence.unusable}")
     slow = evidence.settled and frames.rate < LOW_RATE * evidence.rate_hz
@@ -173,16 +205,17 @@ def _frame_causes(evidence: Evidence) -> list[str]:
                      f"{WINDOW:.0f} s. {profile_remedy()}")
     elif slow and not evidence.pace_by_stamp:
         found.append(f"{topic}: {frames.rate:.1f} frames/s arrive, the policy needs {evidence.rate_hz:g}: raise the "
-                     "camera's rate")
+                     f"{evidence.sensor}'s rate")
     if abs(frames.stamp_age) > evidence.stamp_limit:
         side = "behind" if frames.stamp_age > 0 else "ahead of"
-        found.append(f"the camera's clock is {abs(frames.stamp_age):.2f} s {side} this computer's: synchronise both "
-                     "(chrony, ptp), or give --stamp-age inf")
+        found.append(f"the {evidence.sensor}'s clock is {abs(frames.stamp_age):.2f} s {side} this computer's: "
+                     "synchronise both (chrony, ptp), or give --stamp-age inf")
     if not evidence.pace_by_stamp and not 0.8 <= frames.pace <= 1.25:
         found.append(f"the stamps run at {frames.pace:.2f} times real time: run the simulator in real time, or give "
                      "--pace stamp")
     if frames.unchanged:
-        found.append(f"{topic}: the frames do not change: the camera is frozen, or looks at one still picture")
+        found.append(f"{topic}: the frames do not change: the {evidence.sensor} is frozen, or looks at one still "
+                     "picture")
     if evidence.blind:
         found.append(f"{topic}: the frames are uniformly black or white: check lens, light and exposure")
     return found

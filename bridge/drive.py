@@ -1,4 +1,4 @@
-"""Run the policy node: camera image in, wheel command out.
+"""Run the policy node: camera image, or whatever else the policy reads, in; wheel command out.
 
     python -m bridge.drive runs/corridor/policy
 
@@ -10,6 +10,7 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,14 @@ from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.commands import endpoints
 from bridge.controller import Controller
-from bridge.diagnosis import Evidence, FrameLog, causes
+from bridge.diagnosis import Evidence, FrameLog, causes, input_cause
+from bridge.exits import Exit, OptionError, refusal
+from bridge.image import ImageError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
-from bridge.policy import Policy, PolicyFileError
-from bridge.safety import SafetyConfig
+from bridge.policy import Policy, SensorInput
+from bridge.safety import Command, SafetyConfig
+from bridge.sense_topics import SenseTopic, reader_of, topics_of
+from bridge.senses import SenseError
 from bridge.vehicle_node import NOT_ACTIVE, WATCH_PERIOD, VehicleNode, add_options, limits
 from bridge.view import view_of
 
@@ -72,7 +77,10 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 
 def safety_config(policy: Policy, options: argparse.Namespace) -> SafetyConfig:
     """Return the limits in force: the policy's own, narrowed by base and command line, zero always included."""
-    low, high = limits(policy.contract.low, policy.contract.high, options)
+    low, high = limits(policy.commands.low, policy.commands.high, options)
+    if not all(options.slew):
+        raise OptionError(f"--slew {options.slew[0]:g} {options.slew[1]:g}: both must be above 0, or the vehicle never "
+                          "moves. Correct them or leave them out.")
     return SafetyConfig(low=low, high=high, slew=(options.slew[0], options.slew[1]),
                         frame_age=options.frame_age, stamp_age=options.stamp_age,
                         hold_zeros=BASES[options.base].hold_zeros,
@@ -83,18 +91,23 @@ class DriveNode(VehicleNode):
     """Connects one controller to the ROS graph."""
 
     def __init__(self, node: Any, controller: Controller, options: argparse.Namespace) -> None:
-        from sensor_msgs.msg import CompressedImage, Image
-
         super().__init__(node, controller, options)
         self.controller = controller
         self._frames = FrameLog()
-        self._image_topic = node.resolve_topic_name(options.image_topic)
         self._incompatible = False
         self._camera_since = self._started
         self._last_frame = -math.inf
-        self._image_type = CompressedImage if options.compressed else Image
-        ros.subscribe_images(node, self._image_type, self._image_topic, self._on_image, self._on_incompatible,
-                             self._on_lost)
+        pacer = controller.policy.pacer
+        self._topics = {name: SenseTopic(node.resolve_topic_name(self._topic_name(name, topic)), topic.kind)
+                        for name, topic in topics_of(controller.policy.sensors).items()}
+        if pacer.kind == "camera" and options.compressed:
+            self._topics[pacer.name] = SenseTopic(self._topics[pacer.name].topic, "sensor_msgs/CompressedImage")
+        self._pacer = self._topics[pacer.name]
+        heard = self._on_image if pacer.kind == "camera" else self._on_paced(pacer)
+        ros.subscribe_images(node, self._pacer.message, self._pacer.topic, heard, self._on_incompatible, self._on_lost)
+        for name, stream in controller.senses.streams.items():
+            topic = self._topics[name]
+            node.create_subscription(topic.message, topic.topic, self._on_sensed(stream.sensor), ros.best_effort())
         self._ticked, self._simulated = self._started, 0
         if ros.uses_simulated_time(node):
             ros.steady_timer(node, WATCH_PERIOD, self._watch_simulated_time)
@@ -102,6 +115,11 @@ class DriveNode(VehicleNode):
             self.supervisor.block(NOT_ACTIVE, True)
             node.on_active_change = self._on_active_change
         self.start()
+
+    def _topic_name(self, name: str, topic: SenseTopic) -> str:
+        """Return the topic of a sensor before remapping: that of the first camera is an option."""
+        paces = name == self.controller.policy.pacer.name and topic.topic == ros.IMAGE_TOPIC
+        return self.options.image_topic if paces else topic.topic
 
     def has_time(self, now: float) -> bool:
         """Return whether the last command is out and the next frame far."""
@@ -116,18 +134,65 @@ class DriveNode(VehicleNode):
         self.supervisor.block(CLOCK_STANDS, now + WATCH_PERIOD - self._ticked > self.options.frame_age)
 
     def causes(self) -> list[str]:
-        """Return what is wrong with camera, base and guard now, each with its remedy."""
-        return causes(self._evidence())
+        """Return what is wrong with sensors, base and guard now, each with its remedy."""
+        now = time.monotonic()
+        found = causes(self._evidence())
+        for name, stream in self.controller.senses.streams.items():
+            topic = self._topics[name]
+            publishers = endpoints(self.node.get_publishers_info_by_topic(topic.topic))
+            cause = input_cause(name, topic.topic, topic.full_kind, publishers, stream, now)
+            if cause and (publishers or now - self._started > STARTING):
+                found.append(cause)
+        return found
 
     def _on_image(self, message: Any) -> None:
         now = time.monotonic()
-        stamp = ros.stamp_seconds(message.header.stamp)
-        age = self.node.get_clock().now().nanoseconds * 1e-9 - stamp
+        stamp, age = self._stamp_of(message)
         if self.options.compressed:
             command = self.controller.on_compressed(now, stamp, age, message.data)
         else:
-            command = self.controller.on_image(now, stamp, age, message.height, message.width, message.encoding,
-                                               message.step, message.data)
+            command = self.controller.on_image(now, stamp, age, message)
+        self._took_paced(now, stamp, age, command)
+
+    def _on_paced(self, sensor: SensorInput) -> Callable[[Any], None]:
+        """Return what takes the messages of a pacer that is no camera."""
+        read = reader_of(sensor, self.controller.senses.unwrapped)
+
+        def heard(message: Any) -> None:
+            now, command = time.monotonic(), None
+            stamp, age = self._stamp_of(message)
+            try:
+                value, digest = read(message)
+                command = self.controller.on_paced(now, stamp, age, value, digest)
+            except (SenseError, ImageError) as error:
+                self.controller.refuse(str(error))
+            self._took_paced(now, stamp, age, command)
+
+        return heard
+
+    def _on_sensed(self, sensor: SensorInput) -> Callable[[Any], None]:
+        """Return what takes the messages of a sensor beside the pacer."""
+        read = reader_of(sensor, self.controller.senses.unwrapped)
+
+        def heard(message: Any) -> None:
+            now = time.monotonic()
+            try:
+                value, digest = read(message)
+            except (SenseError, ImageError) as error:
+                self.controller.senses.streams[sensor.name].refuse(now, str(error))
+                return
+            stamp, age = self._stamp_of(message)
+            self._publish(self.controller.on_sensed(now, sensor.name, stamp, age, value, digest))
+
+        return heard
+
+    def _stamp_of(self, message: Any) -> tuple[float, float]:
+        """Return the stamp of a message and its age [s], on the node's clock."""
+        stamp = ros.stamp_seconds(message.header.stamp)
+        return stamp, self.node.get_clock().now().nanoseconds * 1e-9 - stamp
+
+    def _took_paced(self, now: float, stamp: float, age: float, command: Command | None) -> None:
+        """Send what a message of the pacer gave, and note the message."""
         self._publish(command)
         self._last_frame, self._incompatible = now, False
         digest = -self.supervisor.counts["unusable"] if self.controller.unusable else self.controller.digest
@@ -142,13 +207,14 @@ class DriveNode(VehicleNode):
     def _evidence(self) -> Evidence:
         now = time.monotonic()
         self._frames.trim(now)
-        cameras = endpoints(self.node.get_publishers_info_by_topic(self._image_topic))
+        cameras = endpoints(self.node.get_publishers_info_by_topic(self._pacer.topic))
         if not cameras:
             self._camera_since = now
         settled = self._frames.is_full(now) if self._frames.count else now - self._camera_since > STARTING
         return Evidence(
-            image_topic=self._image_topic, image_type=f"sensor_msgs/msg/{self._image_type.__name__}", cameras=cameras,
-            frames=self._frames, rate_hz=self.controller.policy.contract.rate_hz, stamp_limit=self.options.stamp_age,
+            image_topic=self._pacer.topic, image_type=self._pacer.full_kind, cameras=cameras,
+            sensor=self.controller.policy.pacer.kind, frames=self._frames,
+            rate_hz=self.controller.policy.commands.rate_hz, stamp_limit=self.options.stamp_age,
             command_topic=self.commands.name, command_type=self.commands.kind, listeners=self._listeners,
             guard=self.guard.problem(now), settled=settled, silence=self._frames.silence(now),
             image_bytes=self.controller.image_bytes, incompatible=self._incompatible,
@@ -159,16 +225,19 @@ class DriveNode(VehicleNode):
 
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until SIGTERM or Ctrl-C; return 2 where the policy file or an option is refused."""
+    """Run the node until SIGTERM or Ctrl-C; return an `Exit`: FAULT where the policy file is refused."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
         options = parse_arguments(parameters.as_options(ros_arguments, ros.DRIVE_NAME, "policy") + own)
         policy = Policy.load(options.policy)
+        if options.joystick_lock and not options.require_arm:
+            raise OptionError("--joystick-lock takes the joystick from the rider, so an operator must arm. Give "
+                              "--require-arm too.")
         safety = safety_config(policy, options)
-        view = view_of(policy.contract, options.crop and tuple(options.crop), options.calibration)
-    except (PolicyFileError, ValueError) as error:
+        view = view_of(policy.pacer, options.crop and tuple(options.crop), options.calibration)
+    except ValueError as error:
         print(f"bridge.drive: {error}", file=sys.stderr)
-        return 2
+        return refusal(error)
     with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
         controller = Controller(policy, safety, on_blind=options.blind, on_novel=options.novel,
                                 pace_by_stamp=options.pace == "stamp", view=view)
@@ -180,7 +249,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.results:
             supervisor = drive.supervisor
             ros.write_json(options.results, {"counts": dict(supervisor.counts), "reason": supervisor.reason})
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

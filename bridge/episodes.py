@@ -26,6 +26,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from bridge.exits import OptionError
+
 PROTOCOL = 1
 LARGEST = 65536
 """Bytes of the longest message."""
@@ -84,7 +86,7 @@ def receive(connection: socket.socket, wait: float | None) -> dict[str, Any] | N
 
 
 def _read(connection: socket.socket, count: int) -> bytes | None:
-    """Return so many bytes, None where the connection ends before; after the first byte PATIENCE holds."""
+    """Return this many bytes, None where the connection ends before; after the first byte PATIENCE holds."""
     parts = bytearray()
     while len(parts) < count:
         part = connection.recv(count - len(parts))
@@ -125,8 +127,8 @@ class EpisodeServer:
             OSError: the address or port cannot be had.
         """
         if address not in LOOPBACK and not token:
-            raise ValueError(f"episode control on {address}: others could drive the simulator. Give a token, or listen "
-                             "on 127.0.0.1.")
+            raise OptionError(f"episode control on {address}: others could drive the simulator. Give a token, or "
+                              "listen on 127.0.0.1.")
         self._calls, self._token = calls, token
         self._one = threading.Lock()
         self._free = threading.Semaphore(CLIENTS)

@@ -16,6 +16,8 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandTopic
+from bridge.exits import Exit
+from bridge.joystick_lock import JoystickLock
 from bridge.options import Parser, ends_at_ctrl_c, topic_name, whole
 from bridge.vehicle_time import VehicleTime
 
@@ -46,6 +48,8 @@ class Watchdog:
         """How often a node was found silent while it drove."""
         self.zeros = 0
         """Zeros sent so far."""
+        self.abandoned = False
+        """Whether a node fell silent while it drove, or all that were heard are gone, and none was heard since."""
         self.heard: dict[str, float] = {}
         """Time of the last heartbeat by the session of its node."""
         self._driving: dict[str, float] = {}  # time of the last sign of life of each session that drives
@@ -58,6 +62,7 @@ class Watchdog:
         if session not in self._driving and driving:
             self._stands = False  # until a zero is heard, a driving node counts as moving the vehicle
         self.heard[session] = now
+        self.abandoned = False
         if driving:
             self._driving[session] = now
         else:
@@ -75,12 +80,14 @@ class Watchdog:
         for session, alive in list(self._driving.items()):
             if now - alive > self.silence and not late:
                 del self._driving[session]
+                self.abandoned = True
                 if not self._stands:
                     self._left, self._next = REPEATS, now
                     self.stops += 1
         for session, heard in list(self.heard.items()):
             if now - heard > FORGET:
                 del self.heard[session]
+                self.abandoned = self.abandoned or not self.heard
         if self._left and now >= self._next:
             self._left, self._next, self.zeros = self._left - 1, now + 0.05, self.zeros + 1
             return True
@@ -101,6 +108,7 @@ class GuardNode:
             self.now, self.watchdog = (vehicle_time := VehicleTime()), Watchdog(SIMULATED * SILENCE)
             ros.subscribe_clock(node, lambda _: vehicle_time.on_clock())
         self._ready = False
+        self._lock = JoystickLock(ros.joystick_locker(node)) if options.joystick_lock else None
         self._type = String
         self.topic = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
         self._beat = node.create_publisher(String, ros.GUARD_TOPIC, ros.reliable())
@@ -127,6 +135,10 @@ class GuardNode:
         if self.watchdog.tick(self.now()):
             self._on_beat()  # first, so that nobody takes the zero for a stranger's
             self.topic.publish(0.0, 0.0)
+        if self._lock is not None and self.watchdog.abandoned:
+            self._lock.want(time.monotonic(), False)  # it outlives the node that asked for it
+        elif self._lock is not None:
+            self._lock.forget()
         if self.watchdog.stops != stops:
             self.node.get_logger().error(f"the policy node gave no sign of life for {self.watchdog.silence:g} s: "
                                          "vehicle stopped")
@@ -223,6 +235,8 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto")
     parser.add_argument("--follow", default="", metavar="SESSION", help="guard this node only, and end after it")
+    parser.add_argument("--joystick-lock", action="store_true",
+                        help="unlock the chair's joystick where the policy node has died: it may have locked it")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
                         help="SCHED_FIFO priority, like 20")
     return parser.parse_args(arguments)
@@ -235,7 +249,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse_arguments(own)
     with ros.node_session(ros.GUARD_NAME, ros_arguments, options.realtime) as node:
         ros.spin(node, GuardNode(node, options).finished)
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ declared encodings are read; any other is refused rather than guessed.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
 
@@ -29,22 +30,34 @@ class ImageError(ValueError):
     """The message does not describe a usable image; the frame is to be dropped."""
 
 
-def to_rgb8(height: int, width: int, encoding: str, step: int, data: object, size: tuple[int, int] = (64, 64),
-            crop: Crop | None = None) -> np.ndarray:
+@dataclass(frozen=True)
+class RawImage:
+    """The fields of sensor_msgs/Image that count; where one is asked for, such a message serves as well."""
+
+    height: int
+    """Rows."""
+    width: int
+    """Columns."""
+    encoding: str
+    """One of CHANNELS."""
+    step: int
+    """Bytes of one row, at least the pixels' own."""
+    data: object
+    """The bytes: `bytes`, `array.array` or anything else with the buffer protocol."""
+
+
+def to_rgb8(image: RawImage, size: tuple[int, int] = (64, 64), crop: Crop | None = None) -> np.ndarray:
     """Return the image (H, W, 3) uint8 in red, green, blue order, resized by area averaging.
 
     Args:
-        height: rows of the message.
-        width: columns of the message.
-        encoding: one of CHANNELS.
-        step: bytes of one row, at least the pixels' own.
-        data: the bytes: `bytes`, `array.array` or anything else with the buffer protocol.
+        image: the message.
         size: rows and columns of the result.
         crop: the part of the image to use; None: all of it.
 
     Raises:
         ImageError: naming the field, its value, the rule and the remedy.
     """
+    height, width, encoding, step = image.height, image.width, image.encoding, image.step
     if encoding not in CHANNELS:
         raise ImageError(f"image encoding {encoding!r}: only {', '.join(CHANNELS)} are read. Set the camera to one of "
                          "them.")
@@ -54,7 +67,7 @@ def to_rgb8(height: int, width: int, encoding: str, step: int, data: object, siz
     if step < channels * width:
         raise ImageError(f"image step {step}: a row of {width} pixels has {channels * width} bytes. Correct the "
                          "publisher.")
-    buffer = np.frombuffer(data, np.uint8)  # type: ignore[call-overload]  # any buffer
+    buffer = np.frombuffer(image.data, np.uint8)  # type: ignore[call-overload]  # any buffer
     if buffer.size != height * step:
         raise ImageError(f"image data of {buffer.size} bytes: {height} rows of {step} bytes are {height * step}. "
                          "Correct the publisher.")

@@ -23,6 +23,7 @@ import numpy as np
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
+from bridge.exits import Exit, OptionError, refusal
 from bridge.fitted_reach import simulate_reach
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
 from bridge.record import RecordNode, add_dataset_options, write_dataset_file
@@ -233,8 +234,8 @@ def prepare(options: argparse.Namespace) -> tuple[CommandTable, SafetyConfig, st
         fitted = simulate_reach(table, options.vehicle_file, options.radius, options.draws)
         try:
             place = f"{check_space(fitted.widest, tuple(options.space))} In simulation {fitted}."
-        except ValueError as error:
-            raise ValueError(f"{options.commands}: in simulation {fitted}. So {error}") from None
+        except OptionError as error:
+            raise OptionError(f"{options.commands}: in simulation {fitted}. So {error}") from None
     safety = SafetyConfig(low=low, high=high, hold_zeros=BASES[options.base].hold_zeros, frame_age=0.25,
                           stamp_age=math.inf, require_arm=True, auto_resume=False)
     return table, safety, place
@@ -244,7 +245,7 @@ def prepare(options: argparse.Namespace) -> tuple[CommandTable, SafetyConfig, st
 def main(arguments: list[str] | None = None) -> int:
     """Drive until all replicates are done, SIGTERM or Ctrl-C.
 
-    Returns 2 where the manoeuvre is refused, 3 where it ended before its last replicate, 4 where recording failed.
+    Returns an `Exit`: REFUSED where the manoeuvre does not fit, SHORT where it ended before its last replicate.
     """
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -257,10 +258,10 @@ def main(arguments: list[str] | None = None) -> int:
             write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
         print(f"{NAME}: {said(error)}", file=sys.stderr)
-        return 2
+        return refusal(error)
     print(f"{NAME}: {place}", file=sys.stderr)
     if options.check:
-        return 0
+        return Exit.DONE
     print(f"{NAME}: {table.seconds:.0f} s, {options.repeat} times. Arm each with Enter, or with a message on "
           f"{ros.REARM_TOPIC}.", file=sys.stderr)
     with ros.node_session(ros.MANOEUVRE_NAME, ros_arguments, options.realtime) as node:
@@ -272,8 +273,8 @@ def main(arguments: list[str] | None = None) -> int:
             manoeuvre.close()
     if manoeuvre.failure:
         print(f"{NAME}: {manoeuvre.failure}", file=sys.stderr)
-        return 4
-    return 0 if player.finished else 3
+        return Exit.FAULT
+    return Exit.DONE if player.finished else Exit.SHORT
 
 
 if __name__ == "__main__":

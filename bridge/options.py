@@ -12,9 +12,11 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn
 
+from bridge.exits import Exit
+
 
 def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
-    """Let a command's `main` return 130 after one line where Ctrl-C comes before or after its node spins."""
+    """Let a command's `main` return `Exit.STOPPED` after one line where Ctrl-C comes before or after its node spins."""
 
     @wraps(main)
     def guarded(arguments: list[str] | None = None) -> int:
@@ -23,7 +25,7 @@ def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int
         except KeyboardInterrupt:
             name = getattr(main.__globals__.get("__spec__"), "name", "bridge")
             print(f"{name}: stopped (SIGINT)", file=sys.stderr)
-            return 130
+            return Exit.STOPPED
 
     return guarded
 
@@ -32,9 +34,17 @@ class Parser(argparse.ArgumentParser):
     """An `argparse.ArgumentParser` whose complaint is one line, without the usage; it takes no empty words."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse an empty word, which as a path would be the folder that the command is called in."""
+        """Refuse an empty word, which as a path would be the folder that the command is called in; a path whose ~ the
+        shell has left as it is; and an option that is given again, where only the last one would count."""
         words = sys.argv[1:] if args is None else list(args)
+        repeatable = {name for one in self._actions if isinstance(one, argparse._AppendAction)
+                      for name in one.option_strings}
+        names = [word.partition("=")[0] for word in words if word.startswith("--") and word != "--"]
+        if again := [name for name in names if names.count(name) > 1 and name not in repeatable]:
+            self.error(f"{again[0]}: is given twice. Leave one out")
         for before, word in zip(["", *words], words, strict=False):
+            if word.rpartition("=")[2].startswith("~/"):
+                self.error(f"{word}: the shell has not put your home folder in place of ~. Write it out")
             if not word.strip() or word.startswith("--") and word.endswith("="):
                 self.error(f"{before or word or 'the first word'}: an empty word, as of an unset variable. "
                            "Give a value")
@@ -43,7 +53,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and end with code 2."""
         print(f"{self.prog}: {' '.join(message.split()).rstrip('.')}. See --help.", file=sys.stderr)
-        raise SystemExit(2)
+        raise SystemExit(int(Exit.REFUSED))
 
 
 def in_range(
@@ -81,10 +91,10 @@ def topic_name(text: str) -> str:
 
 
 def said(error: BaseException) -> str:
-    """Return what went wrong with a file or an option, without the number of the system's error."""
+    """Return what went wrong with a file or an option in one line, without the number of the system's error."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}. Choose another place"
-    return str(error)
+    return " ".join(str(error).split())
 
 
 def result_file(text: str) -> Path:

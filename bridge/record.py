@@ -22,6 +22,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandListener
+from bridge.exits import Exit, refusal
 from bridge.mcap_file import mend
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
 from bridge.split_writer import SplitWriter
@@ -174,7 +175,7 @@ class RecordNode:
     def _on_odometry(self, message: Any) -> None:
         speed, stamp = message.twist.twist, ros.stamp_seconds(message.header.stamp)
         t = self._time(stamp)
-        self._write(lambda writer: writer.odometry(t, *planar_pose(message), speed.linear.x, speed.angular.z, stamp))
+        self._write(lambda writer: writer.odometry(t, planar_pose(message), (speed.linear.x, speed.angular.z), stamp))
 
     def _on_ground_truth(self, message: Any) -> None:
         stamp = ros.stamp_seconds(message.header.stamp)
@@ -272,9 +273,9 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--recover", action="store_true", help="only give recordings of killed recorders their place")
     parser.add_argument("--split", type=in_range(0.5, 600), metavar="SECONDS",
                         help="make a trial of each drive, TRIAL_1, TRIAL_2 and so on; a drive is over when the vehicle "
-                        "has stood for so long")
+                        "has stood this long")
     parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
-                        help="end after so long; 0: at Ctrl-C or SIGTERM")
+                        help="end after this long; 0: at Ctrl-C or SIGTERM")
     parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
     add_dataset_options(parser)
     options = parser.parse_args(arguments)
@@ -332,19 +333,19 @@ def main_recover(dataset: Path) -> int:
         found = recover(dataset)
     except (ValueError, OSError) as error:
         print(f"bridge.record: {said(error)}", file=sys.stderr)
-        return 2
+        return refusal(error)
     for folder in found:
         print(f"bridge.record: {folder}: recovered", file=sys.stderr)
     if not found:
         print(f"bridge.record: {dataset}: no recording of a killed recorder is there", file=sys.stderr)
-    return 0
+    return Exit.DONE
 
 
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Record until the time is over, SIGTERM or Ctrl-C.
 
-    Returns 2 where nothing can be written, 3 without odometry, 4 where writing failed on the way.
+    Returns an `Exit`: FAULT where nothing can be written, also on the way, SHORT without odometry.
     """
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
@@ -359,7 +360,7 @@ def main(arguments: list[str] | None = None) -> int:
         write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
         print(f"bridge.record: {said(error)}", file=sys.stderr)
-        return 2
+        return refusal(error)
     failed = False
     try:
         with ros.node_session(ros.RECORD_NAME, ros_arguments) as node:
@@ -373,12 +374,12 @@ def main(arguments: list[str] | None = None) -> int:
         whole = finish(writer)
     if failed or not whole:
         print("bridge.record: the recording ended early, because nothing could be written any more", file=sys.stderr)
-        return 4
+        return Exit.FAULT
     if not writer.rows["odometry"]:
         print(f"bridge.record: no odometry was recorded: no message came on {options.odometry_topic}, or the vehicle "
               "never moved. A fit needs it; name the vehicle's topic with --odometry-topic.", file=sys.stderr)
-        return 3
-    return 0
+        return Exit.SHORT
+    return Exit.DONE
 
 
 if __name__ == "__main__":

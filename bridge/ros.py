@@ -4,6 +4,7 @@ Only functions import rclpy, so the package can be imported, and its pure parts 
 """
 
 import gc
+import importlib
 import json
 import math
 import os
@@ -11,15 +12,19 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+from bridge.scheduling import ask_for_short_slices, set_realtime
 
 # All names are relative, so a namespace or a remapping moves them: two bridges on one graph never share a topic.
 IMAGE_TOPIC = "sensing/camera/front/image_raw"
 GROUND_TRUTH_TOPIC = "ground_truth/odom"
 ODOMETRY_TOPIC = "whill/odom"
 IMU_TOPIC = "imu"
+GOAL_TOPIC = "goal"
 CAMERA_INFO_TOPIC = "sensing/camera/front/camera_info"
 SCAN_TOPIC = "sensing/lidar/scan"
 MAP_TOPIC = "map"
@@ -27,6 +32,7 @@ PAUSE_TOPIC = "simulate/pause"
 COLLISION_TOPIC = "collision_sensor"
 COMMAND_TOPIC = "whill/controller/cmd_vel"
 CHAIR_STATE_TOPIC = "whill/states/model_cr2"
+JOYSTICK_LOCK_SERVICE = "whill/set_joystick_lock_srv"
 E_STOP_TOPIC = "e_stop"
 ENABLE_TOPIC = "enable"
 JOY_TOPIC = "joy"
@@ -52,16 +58,6 @@ def use_dds_profile(environment: MutableMapping[str, str] = os.environ) -> str:
             return environment[variable]
     environment[PROFILE_VARIABLES[0]] = str(PROFILE)
     return str(PROFILE)
-
-
-def set_realtime(name: str, priority: int) -> None:
-    """Run this thread, and those it starts, before all normal processes; say so where not permitted."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except (OSError, ValueError) as error:
-        print(f"{name}: --realtime {priority}: {error}. It needs a priority from 1 to 99 and the right to use it. "
-              "Run `setcap cap_sys_nice=ep` on the interpreter or raise rtprio in limits.conf; going on without.",
-              file=sys.stderr)
 
 
 def best_effort(depth: int = 1) -> Any:
@@ -105,11 +101,22 @@ def subscribe_own(node: Any, kind: Any, topic: str, callback: Callable[[Any], No
 def subscribe_images(node: Any, kind: Any, topic: str, callback: Callable[[Any], None],
                      incompatible: Callable[[Any], None], lost: Callable[[Any], None]) -> None:
     """Subscribe to a camera, with callbacks for an unfit publisher and, where the middleware reports them, losses."""
-    subscribe_counting_losses(node, kind, topic, callback, best_effort(), lost, incompatible_qos=incompatible)
+    subscribe_counting_losses(node, Topic(kind, topic, best_effort()), callback, lost, incompatible_qos=incompatible)
 
 
-def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any,
-                              lost: Callable[[Any], None], raw: bool = False, **callbacks: Any) -> Any:
+@dataclass(frozen=True)
+class Topic:
+    """What is subscribed to."""
+
+    kind: Any
+    """Class of its messages."""
+    name: str
+    profile: Any
+    """Quality of service."""
+
+
+def subscribe_counting_losses(node: Any, topic: Topic, callback: Callable[[Any], None], lost: Callable[[Any], None],
+                              raw: bool = False, **callbacks: Any) -> Any:
     """Subscribe, with a callback for lost messages where the middleware reports them; return the subscription.
 
     With `raw` the callback gets the serialised message.
@@ -121,10 +128,16 @@ def subscribe_counting_losses(node: Any, kind: Any, topic: str, callback: Callab
         from rclpy.qos_event import UnsupportedEventTypeError  # type: ignore[attr-defined, no-redef]
     try:
         events = subscription_events(message_lost=lost, **callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
+        return node.create_subscription(topic.kind, topic.name, callback, topic.profile, event_callbacks=events, **more)
     except UnsupportedEventTypeError:
         events = subscription_events(**callbacks)
-        return node.create_subscription(kind, topic, callback, profile, event_callbacks=events, **more)
+        return node.create_subscription(topic.kind, topic.name, callback, topic.profile, event_callbacks=events, **more)
+
+
+def message_type(kind: str) -> Any:
+    """Return the class of a message such as sensor_msgs/LaserScan."""
+    package, _, name = kind.partition("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 def is_reliable(policy: Any) -> bool:
@@ -259,6 +272,7 @@ def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bo
     """
     if realtime:
         set_realtime(name, realtime)
+    ask_for_short_slices()
     use_dds_profile()
     try:
         import rclpy
@@ -313,6 +327,17 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
             signal.signal(number, handler)
 
 
+def spin_some(node: Any, seconds: float) -> None:
+    """Serve the callbacks of a node that spins no more, for so long [s] at most."""
+    executor = make_executor()
+    executor.add_node(node)
+    try:
+        executor.spin_once(timeout_sec=seconds)
+    finally:
+        executor.remove_node(node)
+        executor.shutdown()
+
+
 def steady_timer(node: Any, period: float, callback: Callable[[], object]) -> Any:
     """A timer on the steady clock: a node timer would stop with /clock where the simulation's time is used."""
     from rclpy.clock import Clock, ClockType
@@ -332,6 +357,29 @@ def chair_state_type() -> Any:
         raise SystemExit(f"{error}. The chair's state is a whill_msgs/ModelCr2State. Build the maker's "
                          "ros2_whill_interfaces in your workspace and source it.") from error
     return ModelCr2State
+
+
+def joystick_locker(node: Any) -> Callable[[bool, Callable[[bool], None]], None]:
+    """Return a function that asks the WHILL driver to lock the chair's joystick, or to unlock it.
+
+    It calls back with whether the driver has done so, and does nothing while there is no driver.
+
+    Raises:
+        SystemExit: the maker's message package is not installed.
+    """
+    try:
+        from whill_msgs.srv import SetJoystickLock
+    except ImportError as error:
+        raise SystemExit(f"{error}. The joystick's lock is a whill_msgs/SetJoystickLock. Build the maker's "
+                         "ros2_whill_interfaces in your workspace and source it.") from error
+    client = node.create_client(SetJoystickLock, JOYSTICK_LOCK_SERVICE)
+
+    def ask(locked: bool, answered: Callable[[bool], None]) -> None:
+        if client.service_is_ready():
+            future = client.call_async(SetJoystickLock.Request(d0=int(locked)))
+            future.add_done_callback(lambda done: answered(done.exception() is None and done.result().result == 1))
+
+    return ask
 
 
 def stamp_seconds(stamp: Any) -> float:

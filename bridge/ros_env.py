@@ -171,7 +171,7 @@ class RosEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _take(self, stamp: tuple[int, ...]) -> np.ndarray:
         message = self._images[stamp]  # type: ignore[index]
         self._images = {one: image for one, image in self._images.items() if one > stamp}
-        self._image = to_rgb8(message.height, message.width, message.encoding, message.step, message.data, self._size)
+        self._image = to_rgb8(message, self._size)
         return self._image
 
     def _now(self) -> tuple[int, int]:

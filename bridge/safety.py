@@ -201,7 +201,7 @@ class Supervisor:
             stamp_age: time of receipt minus stamp, both of the camera's clock [s].
         """
         silent = self._frames.is_silent(now)
-        verdict = self._frames.judge(now, stamp, digest, stamp_age, self._is_moving())
+        verdict = self._frames.judge(now, stamp, digest, stamp_age, self.is_moving)
         if verdict != "fresh":
             self.counts[verdict] += 1
             return verdict
@@ -341,7 +341,9 @@ class Supervisor:
             self.counts["slew limited"] += 1
         return limited
 
-    def _is_moving(self) -> bool:
+    @property
+    def is_moving(self) -> bool:
+        """True while the vehicle is commanded to move."""
         v_moving, omega_moving = self.config.moving
         return abs(self._command.v) > v_moving or abs(self._command.omega) > omega_moving
 

@@ -17,6 +17,7 @@ import dataclasses
 import importlib
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,7 +25,9 @@ import numpy as np
 
 from bridge import ros
 from bridge.episodes import EpisodeServer
+from bridge.exits import Exit, OptionError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
+from bridge.policy import PolicyFileError, pacer_of
 from bridge.simulate_node import SimulateNode
 from bridge.simulated import SCAN_HEIGHT, SCAN_RANGE, SCAN_RAYS, Frame, Grid, SimulatedVehicle
 
@@ -32,6 +35,8 @@ SIMULATOR = "bridge.simulate:ChairSimulator"
 """What `--simulator` names unless given."""
 TOKEN_VARIABLE = "BRIDGE_TOKEN"
 """Environment variable with the token of episode control; on a command line everybody could read it."""
+EYE = "the camera"
+"""Name of the camera image where a policy reads none."""
 CELL, BORDER, CELLS = 0.05, 1.0, 1000
 """Of the map: edge of a cell [m], free space around everything [m], cells along an edge at most."""
 
@@ -45,15 +50,21 @@ class ChairSimulator:
 
     def __init__(
         self, task: str = "corridor", vehicle: str | Path | None = None, size: tuple[int, int] = (64, 64),
-        **changes: Any,
+        senses: Mapping[str, tuple[Any, Any]] | None = None, **changes: Any,
     ) -> None:
         """Compile the environment of a task with some of its fields changed, and of a vehicle file or preset.
 
-        Without a vehicle: the built-in chair. `size` is height and width of the camera image.
+        Args:
+            task: its name.
+            vehicle: None takes the built-in chair.
+            size: height and width of the camera image.
+            senses: what a policy reads by name, a sensor of whill_mjx and its `SensorInput`; none: the camera alone.
+            changes: fields of the task.
         """
         import jax
 
         from whill_mjx import env as environment
+        from whill_mjx.sensors.camera import Camera
         from whill_mjx.tasks.tasks import make_task
         from whill_mjx.vehicle.kinematics import reference_pose
         from whill_mjx.world.lidar import first_hits
@@ -61,14 +72,22 @@ class ChairSimulator:
         from whill_mjx.world.render import pinhole
 
         fields = {**changes, "action_repeat": 1}
+        senses = senses or {}
+        self.sensors = {name: about for name, (_, about) in senses.items()}
+        pacer = pacer_of(self.sensors)
+        self._eye = pacer.name if pacer is not None and pacer.kind == "camera" else EYE
+        observed = {name: sensor for name, (sensor, _) in senses.items()}
+        if senses and self._eye == EYE:
+            observed[EYE] = Camera()
         env, params = environment.make_env(
-            make_task(task, **fields), vehicle, height=size[0], width=size[1], observations={}
-        )  # the camera alone, whatever the task observes
+            make_task(task, **fields), vehicle, height=size[0], width=size[1], observations=observed
+        )  # what the policy reads, whatever the task observes
         self.env, self.params = env, params
         self.period = float(env.model.config.control_dt)
         self._low = np.array([env.task.v_min, -env.task.omega_max])
         self._span = np.array([env.task.v_max, env.task.omega_max]) - self._low
-        camera = pinhole(env.model.spec.camera.fov_y, *size)
+        mount = getattr(observed.get(self._eye), "mount", None) or env.model.spec.camera
+        camera = pinhole(mount.fov_y, *size)
         self.intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         angles = np.arange(SCAN_RAYS) * 2 * np.pi / SCAN_RAYS
 
@@ -105,15 +124,17 @@ class ChairSimulator:
         return self._frame(time_step)
 
     def _frame(self, time_step: Any) -> Frame:
-        metrics, odometry = time_step.metrics, self._state.vehicle.odometry
+        metrics, odometry, obs = time_step.metrics, self._state.vehicle.odometry, time_step.obs
+        sensed = {name: np.asarray(obs[name]) for name in self.sensors}
         names = ("x", "y", "yaw", "v", "omega")
         x, y, yaw, v, omega = (float(metrics[name]) for name in names)
         reported = [float(getattr(odometry, name)) for name in names]
-        return Frame(np.asarray(time_step.obs), x, y, yaw, v, omega, collided=bool(metrics["collision"]),
+        image = np.asarray(obs[self._eye] if sensed else obs)
+        return Frame(image, x, y, yaw, v, omega, collided=bool(metrics["collision"]),
                      reached_goal=bool(metrics["success"]), done=bool(time_step.terminated | time_step.truncated),
                      terminated=bool(time_step.terminated), reward=float(time_step.reward),
                      odometry=(reported[0], reported[1], reported[2], reported[3], reported[4]),
-                     ranges=np.asarray(self._scan(self._state)))
+                     ranges=np.asarray(self._scan(self._state)), sensed=sensed)
 
 
 class Mover(Protocol):
@@ -160,7 +181,8 @@ class MovedSimulator(ChairSimulator):
         poses = poses_among_people(fastest, task.omega_max, self.period, spec.body_length / 2, spec.body_width / 2)
 
         def look(state: Any, motion: Any, command: Any) -> Any:
-            vehicle = place(env.model, params, *motion)
+            x, y, yaw, v, omega = motion
+            vehicle = place(env.model, params, x, y, yaw, (v, omega))
             count = state.step_count + 1
             ran_into = jnp.asarray(False)
             if state.scene.people is not None:
@@ -240,27 +262,31 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task and "
-                         "vehicle. Correct it or leave it out.") from error
+        raise OptionError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task and "
+                          "vehicle. Correct it or leave it out.") from error
     changes = dict(options.set)
     if options.policy is None:
         given = {"task": options.task or "corridor", "vehicle": options.vehicle, **changes}
     else:
         from whill_mjx.evaluation.policy_world import read_world
 
-        world = read_world(options.policy)
-        same = options.task in (None, world.task)
-        given = {"task": options.task or world.task, "vehicle": options.vehicle or world.vehicle,
-                 "size": (world.height, world.width), **(world.fields if same else {}), **changes}
+        world = read_world(options.policy, options.task)
+        given = {"task": world.task, "vehicle": options.vehicle or world.vehicle,
+                 "size": (world.height, world.width), **world.fields, **changes}
+        if world.senses:
+            given["senses"] = world.senses
     if options.robot is None:
         if options.wheels:
-            raise ValueError("--wheels names the wheels of a robot file. Give --robot too, or leave it out.")
+            raise OptionError("--wheels names the wheels of a robot file. Give --robot too, or leave it out.")
         return factory(**given)
     from sysid.replay.robot_online import OnlineRobot
     from whill_mjx.env import as_vehicle
 
     if options.simulator != SIMULATOR:
-        raise ValueError(f"--robot {options.robot} is driven by a simulator of its own. Leave --simulator out.")
+        raise OptionError(f"--robot {options.robot} is driven by a simulator of its own. Leave --simulator out.")
+    if given.get("senses"):
+        raise OptionError(f"--robot {options.robot} shows its camera alone, and the policy reads "
+                              f"{', '.join(sorted(given['senses']))}. Leave --robot out.")
     robot = OnlineRobot(options.robot, options.wheels or ())
     given["vehicle"] = robot.spec(as_vehicle(given["vehicle"])[0])
     moved: Any = MovedSimulator(robot, **given)
@@ -280,8 +306,7 @@ def field(text: str) -> tuple[str, Any]:
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = Parser(prog="python -m bridge.simulate",
-                                     description="Serve the simulator on the vehicle's topics.")
+    parser = Parser(prog="bridge.simulate", description="Serve the simulator on the vehicle's topics.")
     parser.add_argument("policy", nargs="?", type=Path, help="folder of a policy or of its training: task, gates, "
                         "vehicle and camera are those that it was trained with")
     parser.add_argument("--task", help="default: that of the policy, or corridor")
@@ -294,11 +319,11 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         "of --vehicle")
     parser.add_argument("--wheels", nargs="+", metavar="NAME",
                         help="of --robot: joints or actuators of its driven wheels, left and right")
-    parser.add_argument("--episodes", type=whole(0), default=0, help="end after so many; 0: never")
+    parser.add_argument("--episodes", type=whole(0), default=0, help="end after this many episodes; 0: never")
     parser.add_argument("--seed", type=whole(0), default=0, help="of the first episode; each next one adds 1")
     parser.add_argument("--wait", type=in_range(0), default=10.0,
-                        help="wait so long for a driver before the first one [s]")
-    parser.add_argument("--linger", type=in_range(0), default=1.0, help="listen for so long after the last episode [s]")
+                        help="wait this long for a driver before the first episode [s]")
+    parser.add_argument("--linger", type=in_range(0), default=1.0, help="listen this long after the last episode [s]")
     parser.add_argument("--results", type=result_file, help="JSON file for the outcome of the episodes")
     parser.add_argument("--image-size", type=whole(1, 10_000), nargs=2, metavar=("HEIGHT", "WIDTH"),
                         help="enlarge the camera image")
@@ -318,7 +343,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until its episodes are over, SIGTERM or Ctrl-C; return 2 where an option is refused."""
+    """Run the node until its episodes are over, SIGTERM or Ctrl-C; return an `Exit`."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = parse_arguments(own)
     compiling: Any = contextlib.nullcontext()
@@ -335,7 +360,7 @@ def main(arguments: list[str] | None = None) -> int:
             vehicle = make_vehicle(options)
         except (ValueError, FileNotFoundError) as error:
             print(f"bridge.simulate: {error}", file=sys.stderr)
-            return 2
+            return Exit.FAULT if isinstance(error, PolicyFileError) else Exit.REFUSED
     with ros.node_session("bridge_simulate", ros_arguments, options.realtime) as node:
         simulate = SimulateNode(node, vehicle, options)
         try:
@@ -343,7 +368,7 @@ def main(arguments: list[str] | None = None) -> int:
                 simulate.calls(), options.bind, options.port, os.environ.get(TOKEN_VARIABLE, ""))
         except (ValueError, OSError, OverflowError) as error:
             print(f"bridge.simulate: --port {options.port}: {error}", file=sys.stderr)
-            return 2
+            return Exit.REFUSED
         if server is not None:
             node.get_logger().info(f"episode control on {options.bind}, port {server.port}")
         ros.spin(node, simulate.finished)
@@ -351,7 +376,7 @@ def main(arguments: list[str] | None = None) -> int:
             server.close()
         if options.results:
             ros.write_json(options.results, simulate.results())
-    return 0
+    return Exit.DONE
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, number
+from bridge.sense_topics import message_of, topics_of
 from bridge.simulated import Episode, Frame, SimulatedClock, SimulatedVehicle, enlarge, halfway
 from bridge.simulated_messages import (
     ODOMETRY_DEVIATION,
@@ -54,6 +55,8 @@ class SimulateNode:
         self._collision = node.create_publisher(Bool, ros.COLLISION_TOPIC, ros.latched())
         self._e_stop = node.create_publisher(Bool, ros.E_STOP_TOPIC, ros.latched())
         self._transform = ros.transform_publisher(node)
+        self._senses = self._sense_publishers()
+        self._pose_first = any(one.kind == "odometry" for one in (getattr(vehicle, "sensors", None) or {}).values())
         self._clock = ros.clock_publisher(node) if options.clock else None
         kind = getattr(commands, options.command_type)
         node.create_subscription(kind, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
@@ -209,8 +212,12 @@ class SimulateNode:
     def _show(self, frame: Frame) -> tuple[int, int]:
         """Publish the end of a period, and end the episode where it is over; return the stamp of the image."""
         self._frame = frame
+        self._publish_sensed(frame)  # the sensor that paces the policy comes last
+        if self._pose_first:
+            self._publish_pose(frame)
         stamp = self._publish_image(frame)
-        self._publish_pose(frame)
+        if not self._pose_first:
+            self._publish_pose(frame)
         episode = self.episodes[-1]
         episode.steps += 1
         if not frame.done:
@@ -259,6 +266,23 @@ class SimulateNode:
             self._info.publish(camera_info(message, intrinsics, frame.image.shape[:2]))
         return message.header.stamp.sec, message.header.stamp.nanosec
 
+    def _sense_publishers(self) -> dict[str, tuple[Any, Any]]:
+        """Return sensor and publisher of what a policy reads beside the topics that are there anyway."""
+        sensors = getattr(self.vehicle, "sensors", None) or {}
+        found = {}
+        for name, topic in topics_of(sensors).items():
+            if topic.topic == ros.SCAN_TOPIC:
+                found[name] = sensors[name], self._scan  # as the policy's own lidar sees
+            elif topic.topic not in (ros.IMAGE_TOPIC, ros.ODOMETRY_TOPIC):
+                found[name] = sensors[name], self.node.create_publisher(topic.message, topic.topic, ros.reliable())
+        return found
+
+    def _publish_sensed(self, frame: Frame) -> None:
+        for name, (sensor, publisher) in reversed(self._senses.items()):
+            frame_id = name if sensor.kind in ("camera", "lidar") else "base_link"
+            header = self._stamped(frame_id)
+            publisher.publish(message_of(header, sensor, frame.sensed[name], self.vehicle.period))
+
     def _publish_map(self) -> None:
         grid = getattr(self.vehicle, "grid", None)
         if grid is not None:
@@ -272,5 +296,5 @@ class SimulateNode:
             self._odometry.publish(odometry)
             self._transform("map", "odom", odometry.header.stamp, *between(truth, frame.odometry))
             self._transform("odom", "base_link", odometry.header.stamp, *frame.odometry[:3])
-        if frame.ranges is not None:
+        if frame.ranges is not None and all(publisher is not self._scan for _, publisher in self._senses.values()):
             self._scan.publish(scan_message(self._stamped("base_link"), frame.ranges, self.vehicle.period / 2))

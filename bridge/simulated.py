@@ -1,8 +1,9 @@
 """What any simulator behind the vehicle's topics gives, and how its time and its episodes are kept; no ROS."""
 
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -52,6 +53,8 @@ class Frame:
     ranges: np.ndarray | None = None
     """(N,) free distances [m] around the drive-axle centre, evenly spaced, the first one straight ahead, growing to the
     left; SCAN_RANGE where nothing is. None where the simulator has no scanner."""
+    sensed: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """What the sensors of a policy show, by the names of its inputs."""
 
 
 class SimulatedVehicle(Protocol):
@@ -63,6 +66,8 @@ class SimulatedVehicle(Protocol):
     """Optional: focal lengths and principal point of the camera, fx, fy, cx, cy [pixels]."""
     grid: Grid | None
     """Optional: map of the episode's room; None where there is none."""
+    sensors: Mapping[str, Any]
+    """Optional: the `SensorInput` of each value in a frame's `sensed`."""
 
     def reset(self, seed: int) -> Frame:
         """Begin an episode."""

@@ -1,11 +1,12 @@
 """A long recording in trials: one for each drive between two standstills."""
 
 import itertools
+import tempfile
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from bridge.trial_writer import COLUMNS, TrialWriter
 
@@ -13,10 +14,44 @@ STANDING = (0.01, 0.02)
 """Speeds below which a vehicle counts as standing: v [m/s], omega [rad/s]; odometry is never quite silent."""
 
 
+class Spool:
+    """The whole messages of the last seconds, on disk: images of a standstill would fill the memory.
+
+    They are in two files without a name, which vanish with the process. When the newer one is old enough, it takes the
+    place of the older one.
+    """
+
+    def __init__(self, folder: Path, seconds: float) -> None:
+        """Keep so many seconds of messages, and up to twice as many, in a folder that exists by the first one."""
+        self._folder, self._seconds = folder, seconds
+        self._parts: list[tuple[float, IO[bytes], list[tuple[float, str, Any, int, int]]]] = []
+
+    def put(self, now: float, topic: str, kind: Any, data: bytes) -> None:
+        """Add a message at a steady time [s]."""
+        if not self._parts or now - self._parts[-1][0] > self._seconds:
+            for _, old, _ in self._parts[:-1]:
+                old.close()
+            self._parts = [*self._parts[-1:], (now, tempfile.TemporaryFile(dir=self._folder), [])]
+        _, file, index = self._parts[-1]
+        file.write(data)
+        index.append((now, topic, kind, len(data), time.time_ns()))
+
+    def take(self, since: float) -> Iterator[tuple[str, Any, bytes, int]]:
+        """Hand out the messages from a steady time [s] on, the oldest first, with the Unix time of receipt [ns]."""
+        parts, self._parts = self._parts, []
+        for _, file, index in parts:
+            file.seek(0)
+            for at, topic, kind, length, received in index:
+                data = file.read(length)
+                if at >= since:
+                    yield topic, kind, data, received
+            file.close()
+
+
 class SplitWriter:
     """Takes what a `TrialWriter` takes, and makes a trial of each drive.
 
-    A trial begins so many seconds before the first motion, and ends when the vehicle has stood for as long. What comes
+    A trial begins some seconds before the first motion, and ends when the vehicle has stood for as long. What comes
     while it stands longer is dropped.
     """
 
@@ -42,16 +77,17 @@ class SplitWriter:
         self._dataset, self._stem, self._seconds, self._on_trial, self._clock = dataset, stem, seconds, on_trial, clock
         self._writer: TrialWriter | None = None
         self._waiting: deque[tuple[float, str, tuple[Any, ...]]] = deque()
+        self._spool = Spool(Path(dataset), seconds)
         self._moved = 0.0
 
     def command(self, t: float, v: float, omega: float) -> None:
         """Add a command."""
         self._take("command", (t, v, omega), bool(v or omega))
 
-    def odometry(self, t: float, *values: float) -> None:
-        """Add what the odometry reports: x, y [m], yaw [rad], v [m/s], omega [rad/s] and, where it has one, a stamp."""
-        v, omega = values[3:5]
-        self._take("odometry", (t, *values), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
+    def odometry(self, t: float, pose: Sequence[float], twist: Sequence[float], stamp: float = 0.0) -> None:
+        """Add what the odometry reports, as of `TrialWriter`."""
+        v, omega = twist
+        self._take("odometry", (t, pose, twist, stamp), abs(v) > STANDING[0] or abs(omega) > STANDING[1])
 
     def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
         """Add an outside measurement."""
@@ -62,8 +98,11 @@ class SplitWriter:
         self._take("imu", (t, gyro, stamp))
 
     def message(self, topic: str, kind: Any, data: bytes) -> None:
-        """Add a whole message."""
-        self._take("message", (topic, kind, data))
+        """Add a whole message; while the vehicle stands it waits on disk."""
+        if self._writer is not None:
+            self._take("message", (topic, kind, data))
+        else:
+            self._spool.put(self._clock(), topic, kind, data)
 
     def flush(self) -> None:
         """Hand the rows so far to the operating system; end the drive where nothing has come for long."""
@@ -103,6 +142,8 @@ class SplitWriter:
         for _, what, values in self._waiting:
             getattr(self._writer, what)(*values)
         self._waiting.clear()
+        for message in self._spool.take(self._clock() - self._seconds):
+            self._writer.message(*message)
 
     def _end_if_over(self, now: float) -> None:
         if now - self._moved > self._seconds:

@@ -41,8 +41,8 @@ class Stream:
         if before is not None and self.raw:  # whose messages cannot be distinguished while there are two readers
             self.node.destroy_subscription(before)
             before = None
-        self._reader = ros.subscribe_counting_losses(self.node, self.kind, self.name, self._heard, profile, self._count,
-                                                     self.raw)
+        topic = ros.Topic(self.kind, self.name, profile)
+        self._reader = ros.subscribe_counting_losses(self.node, topic, self._heard, self._count, self.raw)
         if before is not None:
             self.node.destroy_subscription(before)
 

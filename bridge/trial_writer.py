@@ -4,9 +4,11 @@ import contextlib
 import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from bridge.exits import OptionError
 from bridge.mcap_file import McapWriter
 
 COLUMNS = {
@@ -51,11 +53,11 @@ class TrialWriter:
             ValueError: as the constructor.
         """
         if not TRIAL_NAME.fullmatch(trial):
-            raise ValueError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
-                             "Choose another name, like circle_1.")
+            raise OptionError(f"trial {trial!r}: must be letters, digits, '_', '-', '.', because it names a folder. "
+                              "Choose another name, like circle_1.")
         folder = Path(dataset) / "trials" / trial
         if folder.exists():
-            raise ValueError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
+            raise OptionError(f"{folder}: exists already; a recording never replaces another. Choose another name.")
         return folder
 
     def begin(self, t: float) -> None:
@@ -74,13 +76,15 @@ class TrialWriter:
         else:
             self._add("command", t, v, omega)
 
-    def odometry(self, t: float, x: float, y: float, yaw: float, v: float, omega: float, stamp: float = 0.0) -> None:
+    def odometry(self, t: float, pose: Sequence[float], twist: Sequence[float], stamp: float = 0.0) -> None:
         """Add what the vehicle's odometry reports; it is moved to start at the origin with heading 0, yaw unwrapped.
 
-        `stamp` [s] is the message's own time, on whatever clock the vehicle has; 0 where it has none.
+        `pose` is x, y [m] and yaw [rad], `twist` v [m/s] and omega [rad/s]. `stamp` [s] is the message's own time, on
+        whatever clock the vehicle has; 0 where it has none.
         """
         if self._is_early("odometry", t):
             return
+        x, y, yaw = pose
         if self._first_pose is None or self._yaw is None:
             self._first_pose, self._yaw = (x, y, yaw), yaw
         x0, y0, yaw0 = self._first_pose
@@ -88,7 +92,7 @@ class TrialWriter:
         dx, dy = x - x0, y - y0
         along = math.cos(yaw0) * dx + math.sin(yaw0) * dy
         left = -math.sin(yaw0) * dx + math.cos(yaw0) * dy
-        self._add("odometry", t, along, left, self._yaw - yaw0, v, omega, stamp)
+        self._add("odometry", t, along, left, self._yaw - yaw0, *twist, stamp)
 
     def ground_truth(self, t: float, x: float, y: float, yaw: float, stamp: float = 0.0) -> None:
         """Add an outside measurement of the drive-axle centre in the room."""
@@ -98,11 +102,11 @@ class TrialWriter:
         """Add the yaw rate [rad/s] of an inertial measurement unit."""
         self._add("imu", t, gyro, stamp)
 
-    def message(self, topic: str, kind: Any, data: bytes) -> None:
-        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file."""
+    def message(self, topic: str, kind: Any, data: bytes, received: int = 0) -> None:
+        """Add a whole message, serialised, of a topic and a class to the trial's MCAP file; times as `McapWriter`."""
         if self._mcap is None:
             self._mcap = McapWriter(self._partial / MCAP)
-        self._mcap.write(topic, kind, data)
+        self._mcap.write(topic, kind, data, received)
 
     def flush(self) -> None:
         """Hand the rows so far to the operating system."""

@@ -18,7 +18,9 @@ from typing import Any, Protocol
 from bridge import inputs, ros
 from bridge.bases import BASES
 from bridge.commands import Commanders, CommandTopic, Ear, Endpoint
+from bridge.exits import OptionError
 from bridge.guard import BEAT_PERIOD, GuardLink
+from bridge.joystick_lock import JoystickLock
 from bridge.options import in_range, topic_name, whole
 from bridge.safety import Command, State, Supervisor
 from bridge.vehicle_time import VehicleTime
@@ -34,6 +36,8 @@ NO_GUARD, NO_BASE, COMMANDERS = "no guard", "no base listens", "another node pub
 LOOKING = "looking for other nodes that publish commands"
 NOT_ACTIVE = "not activated"
 GUARD_STOPPED = "the guard stopped the vehicle"
+UNLOCKING = 1.0
+"""Seconds for which the end of a node waits for the driver to unlock the joystick."""
 
 
 class Decider(Protocol):
@@ -90,6 +94,7 @@ class VehicleNode:
         self._chair = ChairGate(self.supervisor) if options.whill_state else None
         if self._chair is not None:
             node.create_subscription(ros.chair_state_type(), options.whill_state, self._on_chair, ros.best_effort(10))
+        self._lock = JoystickLock(ros.joystick_locker(node)) if options.joystick_lock else None
         self._jump = self._watch_clock()
         self._diagnose = ros.diagnostics(node)
 
@@ -119,7 +124,19 @@ class VehicleNode:
         self._beat(driving=False)
         if stop:
             self.commands.publish_stops()
+        if self._lock is not None:
+            self._unlock(self._lock)
         self.guard.close()
+
+    def _unlock(self, lock: JoystickLock) -> None:
+        """Give the chair its joystick back, and wait shortly for the driver's answer."""
+        end = time.monotonic() + UNLOCKING
+        while lock.locked is not False and time.monotonic() < end:
+            lock.want(self.now(), False)
+            ros.spin_some(self.node, 0.05)
+        if lock.locked is not False:
+            self.node.get_logger().error("the chair's joystick may still be locked: the driver did not answer. Call "
+                                         f"{ros.JOYSTICK_LOCK_SERVICE} with d0: 0")
 
     def _on_active_change(self, active: bool) -> None:
         self.supervisor.block(NOT_ACTIVE, not active)
@@ -138,6 +155,7 @@ class VehicleNode:
         """Start a guard that outlives this process, its terminal included, by some seconds."""
         arguments = ["--command-topic", self.commands.name, "--command-type", self.options.command_type,
                      "--follow", self.guard.session, "--realtime", str(self.options.realtime)]
+        arguments += ["--joystick-lock"] if self.options.joystick_lock else []
         simulated = str(isinstance(self.now, VehicleTime)).lower()  # the guard counts in the same time
         return subprocess.Popen([sys.executable, "-m", "bridge.guard", *arguments, "--ros-args", "-r",
                                  f"__ns:={self.node.get_namespace()}", "-p", f"use_sim_time:={simulated}"],
@@ -152,6 +170,8 @@ class VehicleNode:
         self._inputs.watch(now)
         if self._chair is not None:
             self._chair.watch(now)
+        if self._lock is not None:
+            self._lock.follow(now, self.supervisor)
         self.supervisor.block(NO_GUARD, bool(self.guard.problem(now)))
         if self._ear.foreign_zero():
             self.supervisor.foreign_command(now)
@@ -175,6 +195,8 @@ class VehicleNode:
         now = self.now()
         self.guard.heard(now, message.data)
         self._ear.guard_reports(self.guard.zeros)
+        if self.guard.stops > self._guard_stops and self._lock is not None:
+            self._lock.forget()  # the guard has unlocked it
         if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
             self.supervisor.fault(GUARD_STOPPED)
         self._guard_stops = self.guard.stops
@@ -248,6 +270,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--whill-state", type=topic_name, default="", metavar="TOPIC",
                         help="whill_msgs/ModelCr2State: drive only a chair that is on, sound, charged and not driven "
                              f"by its joystick; such as {ros.CHAIR_STATE_TOPIC}")
+    parser.add_argument("--joystick-lock", action="store_true",
+                        help="lock the chair's joystick while the vehicle is armed, by the driver's service "
+                             f"{ros.JOYSTICK_LOCK_SERVICE}; it is unlocked at each stop that needs an operator, at the "
+                             "end, and by the guard where this node dies")
     parser.add_argument("--v-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
                         help="[m/s]; default: those of policy and base")
     parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
@@ -265,11 +291,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def limits(low: tuple[float, float], high: tuple[float, float], options: argparse.Namespace
            ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the smallest and largest command: these, narrowed by base and command line, zero always included."""
+    """Return the smallest and largest command: these, narrowed by base and command line, zero always included.
+
+    Raises:
+        OptionError: limits of the command line that leave out zero.
+    """
     base = BASES[options.base]
     lows = [max(min(a, 0.0), b) for a, b in zip(low, base.low, strict=True)]
     highs = [min(max(a, 0.0), b) for a, b in zip(high, base.high, strict=True)]
-    for i, narrower in enumerate((options.v_limits, options.omega_limits)):
+    for i, (name, narrower) in enumerate((("--v-limits", options.v_limits), ("--omega-limits", options.omega_limits))):
+        if narrower and not narrower[0] <= 0 <= narrower[1]:
+            raise OptionError(f"{name} {narrower[0]:g} {narrower[1]:g}: the first must be at most 0 and the second at "
+                              "least, because stopping is a zero command. Correct them.")
         if narrower:
             lows[i], highs[i] = max(lows[i], narrower[0]), min(highs[i], narrower[1])
     return (lows[0], lows[1]), (highs[0], highs[1])

@@ -10,12 +10,13 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bridge.image import Crop, ImageError, compressed_size, compressed_to_rgb8, to_rgb8
+from bridge.exits import OptionError
+from bridge.image import Crop, ImageError, RawImage, compressed_size, compressed_to_rgb8, to_rgb8
 from bridge.parameters import load_yaml
+from bridge.policy import SensorInput
 
 MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Distortion models of sensor_msgs/CameraInfo, and how many coefficients they have."""
@@ -162,11 +163,11 @@ class View:
         """
         self.size, self.crop, self.rectifier = size, crop, rectifier
 
-    def raw(self, height: int, width: int, encoding: str, step: int, data: object) -> np.ndarray:
-        """Return the image (H, W, 3) uint8 of the fields of sensor_msgs/Image; errors as of `to_rgb8`."""
+    def raw(self, image: RawImage) -> np.ndarray:
+        """Return the image (H, W, 3) uint8 of a sensor_msgs/Image; errors as of `to_rgb8`."""
         if self.rectifier is None:
-            return to_rgb8(height, width, encoding, step, data, self.size, self.crop)
-        return self.rectifier(to_rgb8(height, width, encoding, step, data, (height, width)))
+            return to_rgb8(image, self.size, self.crop)
+        return self.rectifier(to_rgb8(image, (image.height, image.width)))
 
     def compressed(self, data: bytes) -> np.ndarray:
         """Return the image (H, W, 3) uint8 of a JPEG or PNG; errors as of `compressed_to_rgb8`."""
@@ -175,22 +176,28 @@ class View:
         return self.rectifier(compressed_to_rgb8(data, compressed_size(data)))
 
 
-def view_of(contract: Any, crop: Crop | None = None, calibration: Path | None = None) -> View:
-    """Return the view of a policy's contract, by the options of the command line.
+def view_of(pacer: SensorInput, crop: Crop | None = None, calibration: Path | None = None) -> View | None:
+    """Return the view of a policy's first camera, by the options of the command line; None where it has no camera.
 
     Raises:
-        ValueError: the calibration cannot be read, or does not serve this policy.
+        ValueError: the calibration cannot be read, or an option does not serve this policy.
     """
-    size = (contract.height, contract.width)
+    if pacer.kind != "camera":
+        if crop is not None or calibration is not None:
+            raise OptionError(f"--crop and --calibration are of a camera, and the policy reads none (its {pacer.kind} "
+                              "paces it). Leave them out.")
+        return None
+    size = pacer.size
     if calibration is None:
         return View(size, crop)
     if crop is not None:
-        raise ValueError("--crop and --calibration: the calibrated view needs the whole image. Leave one of them out.")
-    if "fov_y" not in contract.camera:
+        raise OptionError("--crop and --calibration: the calibrated view needs the whole image. Leave one of them "
+                          "out.")
+    if "fov_y" not in pacer.camera:
         raise ValueError(f"--calibration {calibration}: the policy file does not state its camera's field of view "
                          "(camera.fov_y). Export the policy again, or give --crop.")
     try:
-        return View(size, rectifier=Rectifier(read_calibration(calibration), contract.camera["fov_y"], size))
+        return View(size, rectifier=Rectifier(read_calibration(calibration), pacer.camera["fov_y"], size))
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(calibration)) else f"{calibration}: {text}.") from None

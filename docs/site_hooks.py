@@ -1,10 +1,12 @@
 """What the site has beyond docs/: pages from elsewhere in the repository, and the API from docstrings.
 
 Links between pages are those of the repository, so they work on a code host too. Here they are turned into the site's.
+A picture that stands alone gets its text as a caption, and opens in full size.
 """
 
 from __future__ import annotations
 
+import html
 import importlib
 import posixpath
 import re
@@ -60,6 +62,13 @@ def site_link(target: str, origin: str, page: str) -> str | None:
     return posixpath.relpath(inside, posixpath.dirname(page) or ".") + mark + anchor
 
 
+def captioned(match: re.Match[str]) -> str:
+    """A figure of a picture that stands alone on its line; its text becomes the caption."""
+    text, source = match[1], match[2]
+    return (f'<figure markdown="1">\n[![{text}]({source})]({source})\n\n'
+            f"<figcaption>{html.escape(text, quote=False)}</figcaption>\n</figure>")  # fmt: skip
+
+
 def on_files(files: Any, config: Any) -> Any:
     """Add the pages that docs/ does not have."""
     from mkdocs.structure.files import File
@@ -72,7 +81,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Turn links of the repository into links of the site."""
+    """Turn links of the repository into links of the site, and give pictures their captions."""
     here = page.file.src_uri
     origin = next((source for source, place in ELSEWHERE.items() if place == here), f"docs/{here}")
 
@@ -80,7 +89,9 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         link = site_link(match[2], origin, here)
         return f"`{match[1].strip('`')}`" if link is None else f"[{match[1]}]({link})"
 
+    def text(part: str) -> str:
+        linked = re.sub(r"\[([^\]]*)\]\(([^)\s]+)\)", turned, part)
+        return re.sub(r"^!\[([^\]]*)\]\(([^)\s]+)\)$", captioned, linked, flags=re.MULTILINE)
+
     parts = re.split(r"(^```.*?^```)", markdown, flags=re.DOTALL | re.MULTILINE)
-    return "".join(
-        part if part.startswith("```") else re.sub(r"\[([^\]]*)\]\(([^)\s]+)\)", turned, part) for part in parts
-    )
+    return "".join(part if part.startswith("```") else text(part) for part in parts)

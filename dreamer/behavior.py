@@ -41,7 +41,7 @@ class Imagined:
 
 
 def init_actor(config: DreamerConfig, outputs: int, key: jax.Array) -> Params:
-    """Parameters of the policy: an MLP with so many outputs, which `spaces` turns into actions."""
+    """Parameters of the policy: an MLP with this many outputs, which `spaces` turns into actions."""
     features = config.deter + config.stoch_size
     return world_model.init_head(config, key, features, config.policy_layers, outputs, config.policy_outscale)
 

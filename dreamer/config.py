@@ -3,12 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+import numbers
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax.numpy as jnp
 from jax.typing import DTypeLike
+
+RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("deter", "hidden", "units", "stoch", "blocks", "depth", "patch", "patch_units", "bins",
+                     "batch_size", "imag_horizon", "steps_per_iter"), (1, 1e6)),
+    "scan_unroll": (1, 1000),
+    "classes": (2, 256),  # indices are stored as bytes
+    "batch_length": (2, 1e6),
+    **dict.fromkeys(("vector_layers", "reward_layers", "continue_layers", "policy_layers", "value_layers"), (0, 100)),
+    **dict.fromkeys(("greedy_share", "unimix", "return_lambda", "slow_rate", "return_norm_rate", "average_rate",
+                     "beta1", "beta2", "lr"), (0, 1)),
+    **dict.fromkeys(("min_std", "max_std"), (0, 100)),
+    **dict.fromkeys(("noise_steps", "horizon", "imag_last", "train_ratio"), (0, 1e6)),
+    **dict.fromkeys(("mean_pull", "policy_outscale", "entropy_scale", "slow_reg", "replay_value_scale", "barlow_scale",
+                     "barlow_redundancy", "dyn_scale", "rep_scale", "recon_scale", "vector_scale", "reward_scale",
+                     "continue_scale", "free_nats", "behavior_lr", "agc", "agc_min_norm", "eps"), (0, 1e12)),
+    **dict.fromkeys(("learning_starts", "pretrain_steps", "pretrain_updates", "warmup", "lr_decay"), (0, 1e12)),
+    "replay_capacity": (1, 1e12),
+    "mirror": (0, 1000),
+}  # fmt: skip
+"""Widest sensible range of each number."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +116,7 @@ class DreamerConfig:
     """Updates of the world model alone on these steps, before the first counted one."""
 
     mirror: int = 0
-    """How many times more to remember every step, as the environment's mirror shows it in so many other worlds. Steps
+    """How many times more to remember every step, as the environment's mirror shows it in this many other worlds. Steps
     and ratio count the real ones."""
 
     horizon: float = 333.0
@@ -104,7 +124,7 @@ class DreamerConfig:
     imag_horizon: int = 15
     """Imagined steps."""
     imag_last: int = 0
-    """Imagine from the last so many states of each sequence, and train the critic's replay loss there; 0 means all."""
+    """Imagine from the last N states of each sequence, and train the critic's replay loss there; 0 means all."""
     return_lambda: float = 0.95
     """Lambda of the returns."""
     entropy_scale: float = 3e-4
@@ -172,42 +192,29 @@ class DreamerConfig:
     """Steps of the recurrences unrolled into one loop body: more is faster on a GPU, 1 is best on a CPU."""
 
     def __post_init__(self) -> None:
-        numbers = {field.name: value for field in dataclasses.fields(self)
-                   if isinstance(value := getattr(self, field.name), (int, float))
-                   and not field.name.startswith("pretrain")}  # fmt: skip
-        sizes = ("deter", "hidden", "units", "stoch", "blocks", "depth", "patch", "patch_units", "bins", "batch_size",
-                 "replay_capacity", "imag_horizon", "scan_unroll")  # fmt: skip
-        general = [
-            *((math.isfinite(value) and value >= 0, name, "must be finite and not negative")
-              for name, value in numbers.items()),
-            *((numbers[name] >= 1, name, "must be at least 1") for name in sizes),
-            *((numbers[name] > 0, name, "must be positive") for name in ("lr", "horizon", "min_std", "max_std")),
-        ]  # fmt: skip
-        for ok, field, rule in general:
-            self._require(ok, field, rule)
+        for name, (low, high) in RANGES.items():
+            value, whole = getattr(self, name), isinstance(getattr(type(self), name), int)
+            ok = isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
+            kind = "must be a whole number" if whole else "must be a number"
+            self._require(ok and low <= value <= high, name, f"{kind} in {low:g}..{high:g}")
+        for name in ("lr", "behavior_lr", "horizon", "min_std", "max_std", "train_ratio"):
+            self._require(getattr(self, name) > 0, name, "must be positive")
         rules = (
             (self.deter % self.blocks == 0, "deter", f"must be divisible by blocks ({self.blocks})"),
             (self.bins % 2 == 1, "bins", "must be odd: the middle bin is zero"),
             (self.patch_units % self.blocks == 0, "patch_units", f"must be divisible by blocks ({self.blocks})"),
             (self.depth * self.mults[-1] % self.blocks == 0, "depth", "must give a last stage divisible by blocks"),
-            (2 <= self.classes <= 256, "classes", "must lie in 2..256: indices are stored as bytes"),
             (self.encoder in ("conv", "patch"), "encoder", "must be 'conv' or 'patch'"),
             (self.representation in ("reconstruct", "barlow"), "representation", "must be 'reconstruct' or 'barlow'"),
             (self.representation != "barlow" or not self.decode_only, "decode_only", "must be () without a decoder"),
             (self.replay_memory in ("auto", "device", "host"), "replay_memory", "must be 'auto', 'device' or 'host'"),
             (self.noise_steps == 0 or self.noise_steps >= 1, "noise_steps", "must be 0 or at least 1"),
-            (self.train_ratio > 0, "train_ratio", "must be positive"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
-            (self.mirror >= 0, "mirror", "must not be negative"),
-            (0 <= self.greedy_share < 1, "greedy_share", "must lie in 0..1 and below 1"),
-            (self.behavior_lr > 0, "behavior_lr", "must be positive"),
-            (self.mean_pull >= 0, "mean_pull", "must not be negative"),
-            (0 <= self.average_rate < 1, "average_rate", "must lie in 0..1"),
-            (self.batch_length >= 2, "batch_length", "must be at least 2"),
+            (self.greedy_share < 1, "greedy_share", "must be below 1: somebody explores"),
+            (self.min_std <= self.max_std, "min_std", f"must be at most max_std ({self.max_std:g})"),
             (self.imag_last == 0 or self.imag_last >= 2, "imag_last", "must be 0 (all) or at least 2"),
-            (self.steps_per_iter >= 1, "steps_per_iter", "must be at least 1"),
             (
-                (self.pretrain_steps > 0) == (self.pretrain_updates > 0) and self.pretrain_steps >= 0,
+                (self.pretrain_steps > 0) == (self.pretrain_updates > 0),
                 "pretrain_steps",
                 f"must be positive together with pretrain_updates ({self.pretrain_updates}), or both 0",
             ),

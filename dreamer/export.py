@@ -48,7 +48,7 @@ class Converted:
 
     @classmethod
     def of(cls, network: Network, check_steps: int) -> "Converted":
-        """Convert a network and compare both over so many recurrent steps on random observations."""
+        """Convert a network and compare both over this many recurrent steps on random observations."""
         model = to_onnx(network)
         return cls(network, model, parity(model, network, check_steps))
 
@@ -202,6 +202,8 @@ class SensingPolicy:
     """Shapes by name, (H, W, C) of uint8 or (D,) of float32."""
     weights: Any
     """Pytree of the parameters."""
+    sensors: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    """What measures each observation, as plain JSON: `kind`, `settings`, of a camera `camera` (docs/policy_file.md)."""
 
 
 def export_sensing(
@@ -210,7 +212,7 @@ def export_sensing(
     """Write the policy of a vehicle that observes other sensors than its camera alone, and return its folder.
 
     It is an agent (`export_agent`) whose actions are commands: the contract's limits, rate and action repeat are in the
-    file too. The bridge, which feeds camera images alone, refuses it; evaluations read it.
+    file too, and so are its sensors, which the bridge must know to drive by it.
 
     Args:
         path: folder to write; an existing policy file there is replaced as a whole.
@@ -237,6 +239,7 @@ def export_sensing(
         "observation": {name: list(shape) for name, shape in sorted(obs_shape.items())},
         "action": {"kind": "box", "size": 2, **vehicle["action"]},
         **{name: vehicle[name] for name in ("rate_hz", "action_repeat", "task")},
+        **({"sensors": {name: dict(one) for name, one in sorted(policy.sensors.items())}} if policy.sensors else {}),
     }
     return _write_agent(path, converted, policy.weights, table, vehicle_file)
 

@@ -58,7 +58,7 @@ class HostFrames:
 
 
 def init(obs_shape: ObsShape, shape: tuple[int, int]) -> HostFrames:
-    """An empty store of so many rows and streams."""
+    """An empty store of this many rows and streams."""
     return HostFrames(jnp.zeros((), jnp.int32), Store(obs_shape, shape))
 
 

@@ -187,7 +187,7 @@ def started(config: DreamerConfig, state: TrainState) -> jax.Array:
 
 
 def with_mirrored(env: FunctionalEnv, env_state: EnvState, transition: Transition, worlds: int) -> Transition:
-    """The frames of N instances, and after them the same N as the mirror shows them in each of so many worlds."""
+    """The frames of N instances, and after them the same N as the mirror shows them in each of the other worlds."""
     if not worlds:
         return transition
     assert env.mirror is not None

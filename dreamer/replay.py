@@ -95,7 +95,7 @@ def rows_for(config: DreamerConfig, num_envs: int) -> int:
 
 
 def init(config: DreamerConfig, num_envs: int, obs_shape: ObsShape, action_width: int, copies: int = 1) -> Replay:
-    """An empty memory for actions of so many numbers, with `copies` streams for each instance."""
+    """An empty memory for actions of this many numbers, with `copies` streams for each instance."""
     shape = (rows_for(config, num_envs), copies * num_envs)
     on_host = config.replay_memory == "host"
     return Replay(
@@ -234,7 +234,7 @@ def write_back(config: DreamerConfig, replay: Replay, window: Window, latent: La
 
 
 def overwritten(window: Window, rows: int) -> jax.Array:
-    """(T, B) bool: a later sequence of the batch trains this step too, in a ring of so many rows."""
+    """(T, B) bool: a later sequence of the batch trains this step too, in a ring of this many rows."""
     trained = window.row[1:]
     since = (trained[:, :, None] - trained[0]) % rows  # (T, B, B): steps after the start of each sequence
     order = jnp.arange(trained.shape[1])

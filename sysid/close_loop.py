@@ -21,10 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from whill_mjx.io.command_line import SEED, Range, check_known, listen, refusing, starts
+from whill_mjx.io.command_line import SEED, Range, With, check_known, listen, refusing, starts
+from whill_mjx.io.heartbeat import say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 from sysid import command_line
 from sysid.logs.log import of_file
@@ -52,7 +54,7 @@ class Arguments:
     """Trials in question of a measured set: RUN, GROUP or RUN:FROM-TO, e.g. warthog_gravel or robot1:0-0.667."""
     held_out: tuple[str, ...] = ()
     """Trials of a measured set that are opened after the verdict, in the same form."""
-    reference_train: tuple[str, ...] = ()
+    reference_train: Annotated[tuple[str, ...], With("reference")] = ()
     """Trials of a reference that is a measured set, in the same form."""
     chained: bool = False
     """DRIVE: 6 s steps, chained from 2 s windows, instead of the windows."""

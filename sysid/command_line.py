@@ -47,11 +47,12 @@ def stage(text: str) -> None:
         heartbeat.stage(text)
 
 
-def progress_bar(total: int, what: str = "fit", unit: str = "eval") -> tuple[Progress, Callable[[], None]]:
-    """A bar with rate and remaining time, and the function that closes it."""
+def progress_bar(total: int, what: str = "fit") -> tuple[Progress, Callable[[], None]]:
+    """A line with elapsed and remaining time and a remark, and the function that closes it."""
     from tqdm import tqdm
 
-    bar: Any = tqdm(total=total, desc=what, unit=unit, dynamic_ncols=True)
+    form = "{desc} {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"  # a stage and its cost fit into 80 columns
+    bar: Any = tqdm(total=total, desc=what, dynamic_ncols=True, bar_format=form)
 
     def advance(count: int, remark: str) -> None:
         bar.set_postfix_str(remark, refresh=count == 0)

@@ -32,6 +32,8 @@ def main(config: ConvertConfig) -> Log:
         return to_lerobot(config)
     with refusing(), dataset_folder(config.out):
         log, notes = convert(config)
+    if any(note.startswith("column ") for note in notes):
+        print("columns as --columns takes them, ROLE=FILE/COLUMN:UNIT, and how role and unit were found:")
     for note in notes:
         print(note)
     count, seconds = len(log.trials), sum(trial.duration for trial in log.trials)

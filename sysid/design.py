@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import NOT_NEGATIVE, POSITIVE, OptionError, Range, check_known, listen, refusing, starts
+from whill_mjx.io.heartbeat import say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 import numpy as np
 
@@ -78,6 +80,7 @@ def main(config: DesignConfig) -> list[Path]:
             min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
             float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
             config.seconds)
+        command_line.stage("simulating the manoeuvres of the library: half a minute, most of it compilation")
         found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
                         names=config.parameters or None)
     paths = []
@@ -87,7 +90,7 @@ def main(config: DesignConfig) -> list[Path]:
         write_csv(path, COMMAND_HEADER, command.table)
         paths.append(path)
     print(text(found, config.criterion))
-    paths.append(write_page(config.out.with_suffix(".html"), found, limits, config))
+    paths.append(write_page(config.out.with_suffix(".html"), found, limits, config, describe(subject.params)))
     for path in paths:
         print(f"wrote {path}")
     return paths

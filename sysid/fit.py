@@ -12,15 +12,17 @@ from pathlib import Path
 from typing import Literal
 
 from whill_mjx.io.command_line import listen, starts
+from whill_mjx.io.heartbeat import say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 from sysid import command_line
 from sysid.logs.coverage import doubts
 from sysid.logs.measured import load_any
 from sysid.logs.records import Log
-from sysid.pages.fit_report import fit_dataset
+from sysid.pages.fit_report import Loaded, fit_dataset
 from sysid.pages.report import parameter_table, table
 from sysid.replay.models import Model
 from sysid.run_folder import run_folder, settings_of
@@ -108,8 +110,8 @@ def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None
         print(note)
     progress, close = command_line.progress_bar(expected_steps(settings))
     try:
-        report = fit_dataset(arguments.dataset, arguments.out, config=settings, log=log, progress=progress, model=model,
-                             source={"train": arguments.train, "held_out_selection": arguments.held_out})
+        data = Loaded(log, arguments.dataset, {"train": arguments.train, "held_out_selection": arguments.held_out})
+        report = fit_dataset(data, arguments.out, config=settings, progress=progress, model=model)
     finally:
         close()
     for note in report["dataset"]["notes"][len(log.notes):]:

@@ -45,7 +45,7 @@ class InspectConfig:
     format: Literal["auto", "dataset", "drive_norlab", "mrclam"] = "auto"
     """Form of the data; found out by default."""
     wheels: tuple[str, ...] = ()
-    """Of a robot file: joints or actuators of the driven wheels, left and right."""
+    """Joints or actuators of the driven wheels of a robot file, left and right."""
     json: bool = False
     """Print JSON instead of text."""
     out: Path | None = None

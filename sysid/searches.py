@@ -81,7 +81,7 @@ def compare(arguments: Arguments, log: Log, problem: Problem) -> list[Trace]:
     judge = Judge(problem, log)
     effort = Effort(arguments.trials, arguments.iterations, arguments.starts)
     traces = []
-    progress, close = command_line.progress_bar(len(arguments.methods) * len(arguments.seeds), "searches", "run")
+    progress, close = command_line.progress_bar(len(arguments.methods) * len(arguments.seeds), "searches")
     try:
         for method in arguments.methods:
             for seed in arguments.seeds:

@@ -15,6 +15,7 @@ import pytest
 
 from bridge import chair, guard, record, simulate
 from bridge import drive as bridge_drive
+from bridge.exits import Exit
 from sysid import close_loop, convert, design, fit, inspect, paper, report, searches
 from sysid.logs.conversion import ConvertConfig
 from sysid.pages.paper_page import PaperConfig
@@ -89,6 +90,16 @@ def mistakes(tmp_path_factory):
     ("fit", "data --physics-dt 1e-9", "--physics-dt 1e-09: must be at least 0.0001"),
     ("fit", "data --spread 0", "--spread 0.0: must be above 0"),
     ("fit", "data --method newton", "--method"),
+    ("fit", "data --train circle_1 --train turn_1", "--train: is given twice"),
+    ("fit", "data --out ~/fit", "--out ~/fit: the shell has not put your home folder in place of ~"),
+    ("fit", "data --trials 10", "--trials: has an effect only with --method tpe or cmaes or both"),
+    ("fit", "data --study a", "--study: has an effect only with --storage"),
+    ("close_loop", "data --reference-train a", "--reference-train: has an effect only with --reference"),
+    ("design", "whill_cr --out data/trials/circle_1/command.csv", "lies among the trials of"),
+    ("convert", "data --out new --fps 10", "--fps: has an effect only with --to lerobot"),
+    ("convert", "data --out new --pause 3", "--pause: has an effect only with --split standstill"),
+    ("convert", "data --out new --imu-topic /imu", "--imu-topic: data is a dataset, which says this itself"),
+    ("convert", "data --out new --command-timeout -1", "--command-timeout -1.0: must be at least 0.01"),
     ("fit", "data --out ''", "--out: an empty word"),
     ("fit", "data --out data", "--out data: holds dataset.toml of something else"),
     ("fit", "data --out data/trials/new", "--out data/trials/new: lies among the trials of"),
@@ -267,6 +278,10 @@ BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulat
           "guard": guard.main}  # fmt: skip
 
 
+DAMAGED = {("drive", "nowhere"), ("drive", "file"), ("drive", "empty"), ("record", "file t"), ("simulate", "nowhere")}
+"""Where a file is at fault, and not the command."""
+
+
 @pytest.mark.parametrize("command, words, told", [
     ("drive", "", "policy"), ("drive", "nowhere", "nowhere"), ("drive", "file", "file"), ("drive", "empty", "empty"),
     ("drive", "nowhere --v-limits nan 1", "--v-limits"), ("drive", "nowhere --slew -1 1", "--slew"),
@@ -275,6 +290,7 @@ BRIDGE = {"drive": bridge_drive.main, "record": record.main, "simulate": simulat
     ("drive", "nowhere --signal-age nan", "--signal-age"), ("drive", "nowhere --dead-man-button -7", "--dead-man"),
     ("drive", "nowhere --base tank", "--base"), ("drive", "nowhere --results empty", "--results"),
     ("drive", "nowhere --results no/where.json", "--results"), ("drive", "nowhere --nope", "nope"),
+    ("drive", "nowhere --slew 1 1 --slew 2 2", "--slew: is given twice"), ("drive", "~/policy", "put your home folder"),
     ("drive", "''", "an empty word"), ("drive", "nowhere --results ''", "--results: an empty word"),
     ("record", "", "dataset"), ("record", "new", "trial"), ("record", "new t --seconds -1", "--seconds"),
     ("record", "new t --seconds nan", "--seconds"), ("record", "new t --wheel-radius 0", "--wheel-radius"),
@@ -303,7 +319,8 @@ def test_a_mistake_in_the_bridge_ends_with_one_line(command, words, told, mistak
     except SystemExit as ended:
         code = ended.code
     lines = capsys.readouterr().err.splitlines()
-    assert code == 2 and len(lines) == 1 and told in lines[0], (code, lines)
+    wanted = Exit.FAULT if (command, words) in DAMAGED else Exit.REFUSED
+    assert code == wanted and len(lines) == 1 and told in lines[0], (code, lines)
     assert files_of(mistakes) == before
 
 

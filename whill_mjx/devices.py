@@ -55,7 +55,7 @@ def choose_devices(count: int | None) -> tuple[jax.Device, ...]:
     """The first `count` devices of the run, none for a single one; None takes all of them.
 
     Raises:
-        ValueError: there are not so many, or some of another process would be left out.
+        ValueError: there are fewer, or some of another process would be left out.
     """
     devices = jax.devices()
     if count is not None and not 1 <= count <= len(devices):

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import SEED, OptionError, Range, check_once, listen, refusing, run, starts
+from whill_mjx.io.command_line import SEED, OptionError, Range, With, check_once, listen, refusing, run, starts
 
 if starts(__name__):
     listen()
@@ -68,14 +68,14 @@ class DriveOptions:
     """Drives of each manoeuvre: the same commands from another pose, with other noise."""
     noise: bool = False
     """Add white noise to the measurements."""
-    noise_levels: SensorNoise = field(default_factory=SensorNoise)
+    noise_levels: Annotated[SensorNoise, With("noise")] = field(default_factory=SensorNoise)
     """How much, with --noise."""
     sensors: Sensors = field(default_factory=Sensors)
     """Rates and latencies of the measurements."""
     held_out: tuple[str, ...] = ()
     """Manoeuvres that the dataset declares as never to be fitted."""
     seed: Annotated[int, SEED] = 0
-    """Of start poses and noise."""
+    """Random seed of start poses and noise."""
     scenario: Scenario = field(default_factory=Scenario)
     """How hard the manoeuvres are driven."""
 
@@ -136,7 +136,9 @@ def with_effects(params: VehicleParams, texts: Sequence[str]) -> VehicleParams:
 
 def parse_effect(text: str) -> tuple[str, dict[str, float]]:
     """Name and values of "NAME:PARAMETER=VALUE,..."; ValueError names what is wrong and what is known."""
-    name, _, rest = text.partition(":")
+    name, colon, rest = text.partition(":")
+    if colon and not rest:
+        raise ValueError(f"effect {text!r}: no parameter follows the colon. Write it like command_delay:delay=0.2.")
     values: dict[str, float] = {}
     for pair in filter(None, rest.split(",")):
         key, equals, number = pair.partition("=")
@@ -149,7 +151,7 @@ def parse_effect(text: str) -> tuple[str, dict[str, float]]:
                 f"effect {text!r}: {pair!r} is not PARAMETER=NUMBER{'' if equals else ' (no =)'}. "
                 "Write it like command_delay:delay=0.2."
             ) from None
-    make_effect(name, **values)  # unknown names
+    make_effect(name, **dict.fromkeys(values, 0.0))  # unknown names
     for key, value in values.items():
         about = parameters_of(EFFECTS[name])[key]
         if not (about.low <= value <= about.high or value == about.neutral):
@@ -228,7 +230,8 @@ def record_motion(
             state = substep(model, params, state, command)
             return state, observe(state)
 
-        first = place(model, params, *start)
+        x, y, yaw, v, omega = start
+        first = place(model, params, x, y, yaw, (v, omega))
         last, rest = jax.lax.scan(physics, first, command)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), observe(first), rest), last.diverged
 
@@ -248,6 +251,8 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
     check_once("--effects", [text.partition(":")[0] for text in options.effects])
     if options.replicates < 1:
         raise ValueError(f"--replicates {options.replicates}: must be at least 1. Leave it out for a single drive.")
+    if set(names) == set(options.held_out):
+        raise ValueError(f"--held-out {' '.join(options.held_out)}: leaves no manoeuvre to fit. Leave one out.")
     absent = sorted(set(options.held_out) - set(names))
     if absent:
         raise ValueError(f"--held-out {absent[0]}: not among the manoeuvres driven ({', '.join(names)}). Add it there.")

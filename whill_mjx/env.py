@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.io.fields import ENV, check_fields
-from whill_mjx.sensors.base import Sensor, Sensors, View, as_sensors, begin_sensors, read_sensors
+from whill_mjx.sensors.base import Sensor, Sensors, View, as_sensors, begin_sensors, check_sensor, read_sensors
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.base import scale_action
 from whill_mjx.tasks.check import check_task
@@ -174,7 +174,18 @@ def make_env(
         looks == "rich",
         as_sensors(chosen, known_sensors()),
     )
+    _check_own(env, params)
     return env, params
+
+
+def _check_own(env: Env, params: VehicleParams) -> None:
+    """Trace the first frame with a task or sensors from outside this package; ValueError says what is wrong in them."""
+    own = {name: sensor for name, sensor in env.sensors if not type(sensor).__module__.startswith("whill_mjx.")}
+    if own or not type(env.task).__module__.startswith("whill_mjx."):
+        bare = dataclasses.replace(env, sensors=())
+        state, _ = jax.eval_shape(lambda seed: reset(bare, params, jax.random.key(seed)), 0)
+        for name, sensor in own.items():
+            check_sensor(name, sensor, lambda state: view_of(env, params, state), state)
 
 
 def _looks_of(task: Task, looks: str | None) -> str:
@@ -196,6 +207,8 @@ def as_vehicle(
     if isinstance(vehicle, VehicleSpec):
         return vehicle, preset_params(vehicle, "physical")
     if isinstance(vehicle, tuple):
+        if [type(one) for one in vehicle] != [VehicleSpec, VehicleParams]:
+            raise ValueError(f"vehicle is {vehicle!r}; a pair is a VehicleSpec and its VehicleParams. Give both.")
         return vehicle
     spec, params, _ = load_vehicle(DEFAULT_VEHICLE if vehicle is None else vehicle)
     return spec, params
@@ -323,7 +336,8 @@ def _control_period(
     step_count = state.step_count + 1
     moment = moment_of(env, state, vehicle, command, step_count, collided)
     terms = task.rewards(moment)
-    reward = jnp.asarray(sum(terms.values()))
+    reward, moment = _finite(jnp.asarray(sum(terms.values())), moment)
+    vehicle = dataclasses.replace(vehicle, diverged=moment.diverged)
     ends = endings_of(task, moment)
     terminated = jnp.stack(list(ends.values())).any() | vehicle.diverged
     truncated = (step_count >= task.max_steps) & ~terminated
@@ -344,6 +358,12 @@ def _control_period(
     outcome = Outcome(reward, terminated, truncated, ends | _pose_metrics(env, after))
     still = (state, first_outcome(env, state))  # after the end nothing moves, and the end is reported once
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
+
+
+def _finite(reward: jax.Array, moment: Moment) -> tuple[jax.Array, Moment]:
+    """Reward and moment; one that is no number would stay in a learner for good: it counts 0, and ends the episode."""
+    finite = jnp.isfinite(reward)
+    return jnp.where(finite, reward, 0.0), dataclasses.replace(moment, diverged=moment.diverged | ~finite)
 
 
 def _stopped(env: Env, state: State, vehicle: VehicleState) -> tuple[Scene, VehicleState, jax.Array]:
@@ -471,8 +491,8 @@ def observe(env: Env, state: State) -> jax.Array:
         return _observe_rich(env, state)
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
     intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
-    scene = shown(state.scene, position, rotation, intrinsics, env.width)
-    image = draw(position, rotation, intrinsics, scene, env.height, env.width)
+    scene = shown(state.scene, position, rotation, intrinsics)
+    image = draw(position, rotation, intrinsics, scene)
     if not env.photometric:
         return image
     return augment(image, state.photometry, jax.random.fold_in(state.key, state.step_count))
@@ -498,8 +518,8 @@ def _observe_rich(env: Env, state: State) -> jax.Array:
     metered = [jnp.log(floor_light(lights, *(then[:2] + far * ahead)) + 1e-4) for far in METERED]
     exposure = 0.5 * jnp.exp(-sum(metered) / len(METERED))
     rich = dataclasses.replace(state.scene.rich, lights=dataclasses.replace(lights, exposure=exposure))
-    scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics, env.width)
-    image = draw(position, rotation, intrinsics, scene, env.height, env.width, RICH)
+    scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics)
+    image = draw(position, rotation, intrinsics, scene, RICH)
     turning = state.vehicle.qvel[5] * SHUTTER * intrinsics.fx
     return develop(image, eye, turning, jax.random.fold_in(state.key, state.step_count), state.step_count)
 

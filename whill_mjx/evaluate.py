@@ -8,13 +8,14 @@ POLICY is the folder of an exported policy, or `planner` or `random`. docs/evalu
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, check_once, listen, refusing, run, starts
+from whill_mjx.io.command_line import NOT_NEGATIVE, SEED, Range, With, check_once, listen, refusing, run, starts
 from whill_mjx.io.heartbeat import Heartbeat, say, say_loading
 
 if starts(__name__):
@@ -38,6 +39,7 @@ from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import Task, make_task
 
 SCRIPTED = ("planner", "random")
+NAME = re.compile("[A-Za-z0-9_-]{1,60}")
 KIND = "whill_mjx.evaluate"
 OUTPUTS = ("report.html", "paths.png", "failures.png", "failures.mp4")
 
@@ -72,16 +74,16 @@ class EvaluateOptions:
     """Proofs of sight: black images, the first image frozen, actions of another episode replayed."""
     sweep: tuple[str, ...] = ()
     """Grids such as "obstacle_x=2,3 obstacle_y=-0.4:0.4:5"; "standard" stands for those of the task."""
-    sweep_episodes: Annotated[int, Range(1, 1_000_000)] = 50
+    sweep_episodes: Annotated[int, Range(1, 1_000_000), With("sweep")] = 50
     """Episodes in each cell of a grid."""
-    videos: Annotated[int, NOT_NEGATIVE] = 4
+    videos: Annotated[int, Range(0, 1000)] = 4
     """Failures shown as video, at most."""
     html: bool = False
     """Also write one page with everything."""
     near: Annotated[float, NOT_NEGATIVE] = NEAR_M
     """Distance below which there is a near miss [m]."""
     seed: Annotated[int, SEED] = 2_000_003
-    """Of the episodes; training and its own evaluations use others."""
+    """Random seed of the episodes; training and its own evaluations use others."""
     batch: Annotated[int, Range(1, 1_000_000)] = 1000
     """Episodes at a time."""
     runtime: Literal["jax", "onnxruntime"] = "jax"
@@ -132,13 +134,13 @@ def main(options: EvaluateOptions) -> dict[str, Any]:
 
 def make_plan(options: EvaluateOptions) -> Plan:
     """Read and check everything that an evaluation needs before it drives or writes."""
-    if options.episodes < 1 or options.sweep_episodes < 1 or options.batch < 1:
-        raise ValueError("episodes, sweep_episodes and batch must each be at least 1.")
     policy = None if options.policy in SCRIPTED else load_policy(find_policy(options.policy), options.runtime)
     task = choose_task(options, policy)
     plan = Plan(options, task, policy, [parse_sweep(text) for text in chosen_sweeps(options, task)])
     pairs = [_named(text) for text in options.baselines]
-    check_once("--baselines", [name for name, _ in pairs])
+    check_once("--baselines", [plan.main_name, *(name for name, _ in pairs)])
+    if policy is None and {"blank", "freeze"} & set(options.blind):
+        raise ValueError(f"--blind {' '.join(options.blind)}: {options.policy} does not look at images. Leave it out.")
     others = dict(pairs)
     plan.drivers[plan.main_name] = plan.driver(plan.course())
     for name, source in others.items():
@@ -187,8 +189,10 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
     if options.html:
         from whill_mjx.evaluation.pages import page
 
-        say(f"report: {page(evaluation, pictures, videos, options.out / 'report.html')}")
-    say(f"{options.out / 'evaluation.json'}: {evaluation['seconds']:.0f} s")
+        say(f"open {page(evaluation, pictures, videos, options.out / 'report.html')} in a browser")
+    files = ", ".join(["evaluation.json", *(one.name for one in (*pictures, *videos))])
+    say(f"wrote {files} in {options.out}; {evaluation['seconds']:.0f} s"
+        + ("" if options.html else ". With --html you get one page with everything."))
     return evaluation
 
 
@@ -319,6 +323,9 @@ def _named(text: str) -> tuple[str, str]:
         return text, text
     if not equals or not name or not value:
         raise ValueError(f"{text!r} is not NAME=VALUE. Write it so (a baseline may also be one of {SCRIPTED}).")
+    if not NAME.fullmatch(name):
+        raise ValueError(f"--baselines {text}: a name is letters, digits, _ and -, for it is part of files' names. "
+                         "Correct it.")
     return name, value
 
 

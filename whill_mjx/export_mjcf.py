@@ -130,7 +130,7 @@ class VehicleForces:
     def place(self, data: mujoco.MjData, x: float = 0.0, y: float = 0.0, yaw: float = 0.0, v: float = 0.0,
               omega: float = 0.0) -> None:  # fmt: skip
         """Put the vehicle's reference point at a pose [m, rad], driving at v [m/s] and omega [rad/s], as if new."""
-        state = place(self._static, self._params, x, y, yaw, v, omega)
+        state = place(self._static, self._params, x, y, yaw, (v, omega))
         data.qpos[self._qpos], data.qvel[self._qvel] = np.asarray(state.qpos), np.asarray(state.qvel)
         self._time = math.inf
 

@@ -96,8 +96,8 @@ def vehicle_source(spec: VehicleSpec, params: VehicleParams, physics_dt: float =
             state = _from_numbers(like, given[:-2])
             return _to_numbers(substep(model, params, state, jnp.stack(given[-2:])))
 
-        def placed(*given: jax.Array) -> list[jax.Array]:
-            return _to_numbers(place(model, params, *given))
+        def placed(x: jax.Array, y: jax.Array, yaw: jax.Array, v: jax.Array, omega: jax.Array) -> list[jax.Array]:
+            return _to_numbers(place(model, params, x, y, yaw, (v, omega)))
 
         def posed(*given: jax.Array) -> list[jax.Array]:
             return list(reference_pose(model, _from_numbers(like, given).qpos))

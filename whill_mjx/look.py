@@ -18,9 +18,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from whill_mjx.io.command_line import SEED, OptionError, Range, check_known, listen, refusing, run, starts
+from whill_mjx.io.heartbeat import Heartbeat, say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 import jax
 import jax.numpy as jnp
@@ -123,8 +125,8 @@ def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array
     height, width = 2 * env.height, env.width
     down = jnp.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # right is -y, down is -x, forward is -z
     focal = jnp.asarray(height * 12.0 / 9.0)  # 9 m of ground over the height
-    intrinsics = Intrinsics(focal, focal, jnp.asarray(width / 2), jnp.asarray(height / 2))
-    return render(eye, down, intrinsics, scene, height, width)
+    intrinsics = Intrinsics(focal, focal, jnp.asarray(width / 2), jnp.asarray(height / 2), height=height, width=width)
+    return render(eye, down, intrinsics, scene)
 
 
 def _drive(
@@ -161,14 +163,14 @@ def gallery_sheet(height: int = 96, width: int = 144) -> np.ndarray:
     start, end = walk(jnp.array(0.1)), walk(jnp.array(0.14))
 
     def moving(scene):
-        draw = partial(render, intrinsics=curved, scene=scene, height=height, width=width, quality=best)
+        draw = partial(render, intrinsics=curved, scene=scene, quality=best)
         image = motion_blur(lambda position, rotation: draw(position, rotation), start, end, samples=6)
         warm = Film(jnp.array(1.1), jnp.array([1.06, 1.0, 0.9]), jnp.array(0.45), jnp.array(2.0))
         return develop(image, warm, jax.random.key(0))
 
     plain = dataclasses.replace(scene, finish=None)
-    frame = jax.jit(lambda scene: render_frame(*start, lens, scene, height, width, normals=True))(plain)
-    good = jax.jit(lambda scene: render(*start, lens, scene, height, width, best))(scene)
+    frame = jax.jit(lambda scene: render_frame(*start, lens, scene, normals=True))(plain)
+    good = jax.jit(lambda scene: render(*start, lens, scene, best))(scene)
     depth = depth_picture(np.asarray(frame.depth))
     label = np.asarray(frame.label).astype(int)
     colours = np.random.default_rng(3).integers(40, 256, (label.max() + 1, 3)).astype(np.uint8)[label]
@@ -193,7 +195,7 @@ def film_of(options: Look) -> list[np.ndarray]:
     if options.scene == "gallery":
         scene, lens, best = gallery(), pinhole(1.0, 144, 192), Quality(antialias=True, shadows=True)
         # The scene is an argument: as a constant, XLA would work it out while compiling.
-        draw = jax.jit(lambda share, scene: render(*walk(share), lens, scene, 144, 192, best))
+        draw = jax.jit(lambda share, scene: render(*walk(share), lens, scene, best))
         return [np.asarray(draw(share, scene)) for share in jnp.linspace(0.0, 1.0, 60)]
     env, params = _env(options)
     config, state, plan, plan_key = _start(options, env, params)
@@ -295,10 +297,12 @@ def main(options: Look) -> None:
         write_video(options.out, frames, options.scale)
         print(f"{options.out}: {len(frames)} frames of {options.scene}")
         return
-    if options.scene == "gallery":
-        sheet = gallery_sheet()
-    else:
-        sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
+    with Heartbeat() as heartbeat:
+        heartbeat.stage(f"drawing {options.scene}: half a minute, most of it compilation")
+        if options.scene == "gallery":
+            sheet = gallery_sheet()
+        else:
+            sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
     write_png(options.out, sheet.repeat(options.scale, 0).repeat(options.scale, 1))
     print(f"{options.out}: {options.scene}")
 

@@ -56,12 +56,12 @@ def device_per_core(instances: int) -> tuple:
     import jax
 
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", _cores())
+        jax.config.update("jax_num_cpu_devices", cores())
     found = jax.devices()
     return tuple(found[: max(many for many in range(1, len(found) + 1) if instances % many == 0)])
 
 
-def _cores() -> int:
+def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

@@ -25,16 +25,17 @@ import jax
 
 from dreamer import checkpoint, parallel
 from whill_mjx.devices import choose_devices, join
+from whill_mjx.env import make_env
 from whill_mjx.io.folders import Claim, claim_folder, write_whole
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
 from whill_mjx.learning.index_page import list_results, write_index
+from whill_mjx.learning.memory import check_memory
 from whill_mjx.learning.options import TrainOptions, choose_preset, preset_name
 from whill_mjx.learning.outcome import evaluate_policy, export
 from whill_mjx.learning.ppo import check_minibatches
 from whill_mjx.learning.setup import Preset, variations_of
 from whill_mjx.learning.trainings import Stage, best_params, train_baseline, train_policy
 from whill_mjx.logs.dataset import plain, write_json
-from whill_mjx.tasks.check import check_task
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
@@ -69,7 +70,7 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         from sysid import load_any
 
         load_any(options.log)
-    check_task(preset.task)
+    check_memory(preset, options.learner, make_env(preset.task)[0])
     if any(text != "fit" for text in preset.vary):
         variations_of([text for text in preset.vary if text != "fit"], None)
     if "fit" in preset.vary and options.vehicle is not None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import NOT_NEGATIVE, OptionError, Range, listen, refusing, run, starts
+from whill_mjx.io.command_line import NOT_NEGATIVE, OptionError, Range, With, listen, refusing, run, starts
 
 if starts(__name__):
     listen()
@@ -34,7 +34,7 @@ class ViewOptions:
     """File to write; an earlier one is replaced."""
     serve: bool = False
     """Write nothing; serve the page to browsers of this machine until the command is stopped."""
-    port: Annotated[int, Range(0, 65535)] = 8642
+    port: Annotated[int, Range(0, 65535), With("serve")] = 8642
     """Port on the loopback; 0 takes a free one."""
     embed_mb: Annotated[float, NOT_NEGATIVE] = 40.0
     """Megabytes of pictures and videos to put into the page; others are linked."""

@@ -11,22 +11,22 @@ from benchmarks.claims.claim import Claim as Claim
 HEADLINES = (  # file, what, value
     (
         "physics",
-        "Physics steps per second: 32,768 chairs at once, each with five extra effects",
+        "Physics steps per second on one GPU: 32,768 chairs at once, each with other parameters",
         "{steps_per_s_32768|1e-6} million",
     ),
     (
         "sight",
-        "Success of a camera policy in a simulator it has never seen: furnished corridors (with unusual furniture)",
+        "Success of a camera policy in another simulator: furnished corridors (with things of kinds it never saw)",
         "{foreign_furnished|%} ({foreign_unseen|%})",
     ),
     (
         "learner",
-        "DreamerV3 updates per second, 12 million parameters",
-        "{updates_per_s_12m} (SheepRL: {peer_updates_per_s_12m})",
+        "DreamerV3 updates per second, 12 million parameters (SheepRL, another implementation)",
+        "{updates_per_s_12m} ({peer_updates_per_s_12m})",
     ),
     (
         "course",
-        "Success from pixels in obstacle courses never seen before, after the paper's 22,000 steps",
+        "Success from pixels in new obstacle courses, after the reference paper's 22,000 steps",
         "{success_at_22000|%}",
     ),
     ("course", "Time until PPO succeeds in 99 % of new obstacle courses, compilation included", "{time_to_99_s} s"),
@@ -37,12 +37,12 @@ HEADLINES = (  # file, what, value
     ),
     (
         "fit",
-        "Error on unseen drives, divided by the difference of two repeats of one drive (best possible: about 1.0)",
+        "Position error on drives never fitted, over the difference of two repeats of one drive (best: about 1.0)",
         "{plant_replicate_ratio}",
     ),
     (
         "measured",
-        "Position error of a real robot after 6 s on asphalt, compared with its commands replayed without a fit",
+        "Position of a real robot, predicted 6 s ahead: error, compared with a vehicle that obeys its commands at once",
         "{drive_gain_over_ideal_asphalt|%} less",
     ),
     (

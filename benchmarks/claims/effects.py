@@ -63,8 +63,7 @@ CLAIMS = (
         "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
         "it. 1x is the "
         'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns 2x and 4x '
-        "are of the present decision, on 3 and 10 logs, and 6 and 4 beyond the catalogue. The others are of the "
-        "decision before it.",
+        "are of the present decision. The others are of the decision before it.",
         ("figure", "2x", "4x", "2x, twice the noise", "4x, twice the noise", "4x, heavy scooter"),
         tuple(
             (
@@ -76,11 +75,15 @@ CLAIMS = (
             )
             for label, name, form in (
                 ("named right", "class_accuracy", "%"),
+                ("95 % interval: from", "class_accuracy", ".low %"),
+                ("to", "class_accuracy", ".high %"),
+                ("logs", "class_accuracy", ".n"),
                 ("named wrong", "wrong_name", "%"),
                 ("noticed", "noticed", "%"),
                 ("right names with a warning", "warned_right", "%"),
                 ("members of a class", "mean_class_size", ""),
                 ("beyond the catalogue: `unexplained`", "out_of_catalogue", "%"),
+                ("logs", "out_of_catalogue", ".n"),
             )
         ),
     ),
@@ -99,11 +102,11 @@ CLAIMS = (
             ("false alarms on 200 refitted simulated days of one log", "{refitted_null_alarms}"),
             ("Kolmogorov-Smirnov p-value of the calibrated p-values (uniform if large)", "{null_ks_p}"),
             ("two effects at once: both named right, 13 logs", "{pair_both|%}"),
-            ("the same where both are at least at 2x, 6 logs", "{pair_both_2x|%}"),
+            ("two effects at once, both at least at 2x: both named right, 6 logs", "{pair_both_2x|%}"),
             ("two effects at once: a wrong name, 13 logs", "{pair_wrong|%}"),
             ("effect taken out of the catalogue, 26 logs: `unexplained`", "{left_out_unexplained|%}"),
-            ("the same: named outside its class", "{left_out_outside_class|%}"),
-            ("the same: named wrong without a warning", "{left_out_wrong|%}"),
+            ("effect taken out of the catalogue: named outside its class", "{left_out_outside_class|%}"),
+            ("effect taken out of the catalogue: named wrong without a warning", "{left_out_wrong|%}"),
             ("95 % intervals that hold the planted size, of 5", "{interval_coverage|%}"),
             ("error of the size, median", "{parameter_error|%}"),
             ("held-out error after naming, over the replicates' difference", "{heldout_ratio}"),
@@ -142,7 +145,7 @@ CLAIMS = (
         ("what", "minutes"),
         (
             ("whole loop with 200 refitted simulated days, two CPU cores", "{cpu_seconds|0.0166667}"),
-            ("the same, GPU", "{gpu_seconds|0.0166667}"),
+            ("whole loop with 200 refitted simulated days, GPU", "{gpu_seconds|0.0166667}"),
             ("without refitted days, two CPU cores", "{cpu_quick_seconds|0.0166667}"),
         ),
     ),
@@ -161,7 +164,7 @@ CLAIMS = (
         "Eight logs whose contents are not known here",
         "undeclared_shared",
         "Held-out position error [m] before and after, of the outside pose where there is one.",
-        ("set", "verdict", "looks the same", "values", "before", "after"),
+        ("set", "verdict", "effects that look the same", "values", "before", "after"),
         _shared,
     ),
     Claim(

@@ -77,7 +77,7 @@ CLAIMS = (
             ("720p frame to command, 99 % [ms]", "{frame_720p_p99_ms}", "{frame_720p_p99_realtime_ms}"),
             ("720p frames delivered", "{frames_720p_delivered|%}", "{frames_720p_delivered_realtime|%}"),
             ("error of the pace, 99 % [ms]", "{tick_error_p99_ms}", "{tick_error_p99_realtime_ms}"),
-            ("the same beside two busy processes [ms]", "{interval_p99_ms}", "{interval_p99_realtime_ms}"),
+            ("error of the pace beside two busy processes [ms]", "{interval_p99_ms}", "{interval_p99_realtime_ms}"),
             ("spurious stops of healthy drives", "{healthy_stops}", "-"),
             ("growth of memory in a drive [MB]", "{memory_growth_mb|range}", "-"),
             ("policy step, 99 % [ms]", "{policy_p99_ms}", "-"),

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.effects import EFFECTS
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
 from bridge.options import Parser, in_range, whole
 from whill_mjx.io.command_line import OptionError, guarded
+from whill_mjx.io.heartbeat import Heartbeat
 
 
 def main(arguments: list[str] | None = None) -> Path:
@@ -41,10 +42,12 @@ def main(arguments: list[str] | None = None) -> Path:
         raise OptionError(
             f"--effects {given.effects!r}: not JSON of sizes by name. Write '{{\"slope\": 0.02}}'."
         ) from None
-    return make_log(
-        given.out, effects, given.seed, given.noise, not given.nominal, not given.no_ground_truth, given.manoeuvres,
-        given.replicates, given.answers, given.processes, given.vehicle,
-    )  # fmt: skip
+    experiment = Experiment(
+        effects, given.seed, given.noise, not given.nominal, given.manoeuvres, given.replicates, given.vehicle
+    )
+    with Heartbeat() as heartbeat:
+        heartbeat.stage("driving the manoeuvres on the contact plant")
+        return make_log(given.out, experiment, not given.no_ground_truth, given.answers, given.processes)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
 from bridge.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
@@ -56,7 +56,7 @@ def drive_like(reference: Path, out: Path, seed: int = 1, replicates: int = 3) -
         folder.name[:-2]: np.loadtxt(folder / "command.csv", delimiter=",", skiprows=1)
         for folder in sorted((reference / "trials").glob("*_1"))
     }
-    return make_log(out, seed=seed, day=False, manoeuvres=tables, replicates=replicates)
+    return make_log(out, Experiment(seed=seed, day=False, manoeuvres=tables, replicates=replicates))
 
 
 def plot(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], out: Path) -> None:

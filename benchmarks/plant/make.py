@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from zlib import crc32
 
@@ -47,35 +47,48 @@ class Setting:
     gyro: Gyro | None = None
 
 
+@dataclass(frozen=True)
+class Experiment:
+    """What is driven for a dataset: which vehicle, on which day, under which effects."""
+
+    effects: Mapping[str, float] = field(default_factory=dict)
+    """Sizes by name, in the units of `effects.EFFECTS`."""
+    seed: int = 0
+    """Of command levels, day, start headings, disturbances and sensor noise."""
+    noise: float = 1.0
+    """Factor on all disturbances and sensor noise."""
+    day: bool = True
+    """Whether gains, mass and friction differ from the nominal vehicle's."""
+    manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None
+    """Names out of the nine, or command tables (T, 3) t, v, omega by name; None drives the nine."""
+    replicates: int = 3
+    """Drives of each manoeuvre."""
+    vehicle: str = "chair"
+    """Of `chair.VEHICLES`."""
+    contact: Contact = SLOW
+    """How the contacts are computed."""
+    gyro: Gyro | None = None
+    """What is written to `imu.csv`; nothing by default."""
+
+
 def make_log(
-    out: Path | str, effects: Mapping[str, float] | None = None, seed: int = 0, noise: float = 1.0, day: bool = True,
-    ground_truth: bool = True, manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3,
-    answers: Path | str | None = None, processes: int = 1, vehicle: str = "chair", contact: Contact = SLOW,
-    gyro: Gyro | None = None,
+    out: Path | str, experiment: Experiment = Experiment(), ground_truth: bool = True,  # noqa: B008
+    answers: Path | str | None = None, processes: int = 1,
 ) -> Path:  # fmt: skip
     """Drive a dataset and write it; returns its folder. The same arguments give the same files.
 
     Args:
         out: folder to write; it must not exist.
-        effects: sizes by name, in the units of `effects.EFFECTS`.
-        seed: of command levels, day, start headings, disturbances and sensor noise.
-        noise: factor on all disturbances and sensor noise.
-        day: whether gains, mass and friction differ from the nominal chair's.
+        experiment: what is driven.
         ground_truth: whether the outside pose is written.
-        manoeuvres: names out of the nine, or command tables (T, 3) t, v, omega by name; default: the nine.
-        replicates: drives of each manoeuvre.
         answers: file for what was driven; it must lie outside `out`.
         processes: 1 drives here, more in as many processes.
-        vehicle: of `chair.VEHICLES`.
-        contact: how the contacts are computed.
-        gyro: what is written to `imu.csv`; nothing by default.
 
     Raises:
         ValueError, FileExistsError: naming the value, the rule and the remedy.
     """
     out = Path(out)
-    setting, jobs = plan(effects or {}, seed, noise, day, manoeuvres, replicates, vehicle)
-    setting = replace(setting, contact=contact, gyro=gyro)
+    setting, jobs = plan(experiment)
     if out.exists():
         raise FileExistsError(f"{out}: exists. Name a new folder, or delete this one.")
     if answers is not None and Path(answers).resolve().is_relative_to(out.resolve()):
@@ -86,18 +99,18 @@ def make_log(
             results = [result for part in pool.map(drive_all, [setting] * processes, parts) for result in part]
     else:
         results = drive_all(setting, jobs)
-    write_dataset(out, VEHICLES[vehicle].nominal, {job.name: job.messages for job in jobs}, results, ground_truth)
+    nominal = VEHICLES[experiment.vehicle].nominal
+    write_dataset(out, nominal, {job.name: job.messages for job in jobs}, results, ground_truth)
     if answers is not None:
-        truth = {"effects": dict(setting.effects), "seed": seed, "noise": noise, "day": day, "vehicle": vehicle}
+        truth = {"effects": dict(setting.effects), "seed": experiment.seed, "noise": experiment.noise,
+                 "day": experiment.day, "vehicle": experiment.vehicle}
         write_text(Path(answers), json.dumps(truth, indent=1) + "\n")
     return out
 
 
-def plan(
-    effects: Mapping[str, float], seed: int, noise: float, day: bool,
-    manoeuvres: Mapping[str, np.ndarray] | Sequence[str] | None = None, replicates: int = 3, vehicle: str = "chair",
-) -> tuple[Setting, list[Job]]:  # fmt: skip
-    """Check the arguments of `make_log`, draw the day, list the trials."""
+def plan(experiment: Experiment) -> tuple[Setting, list[Job]]:
+    """Check an experiment, draw its day, list its trials."""
+    effects, seed, noise, vehicle = experiment.effects, experiment.seed, experiment.noise, experiment.vehicle
     unknown = sorted(set(effects) - set(EFFECTS))
     if unknown:
         raise ValueError(f"unknown effect {unknown[0]!r} (known: {', '.join(EFFECTS)}). Correct the name.")
@@ -110,10 +123,11 @@ def plan(
     backward = [f"{name}={size:g}" for name, size in active if size < 0 and not EFFECTS[name].signed]
     if backward:
         raise ValueError(f"effect {backward[0]}: must not be negative [{EFFECTS[backward[0].split('=')[0]].unit}].")
-    chair = VEHICLES[vehicle].on_day(np.random.default_rng([seed, 1])) if day else VEHICLES[vehicle]
+    chair = VEHICLES[vehicle].on_day(np.random.default_rng([seed, 1])) if experiment.day else VEHICLES[vehicle]
     for name, size in active:
         chair = EFFECTS[name].make.change(chair, size)
     tables: Mapping[str, np.ndarray] = nine(seed)
+    manoeuvres = experiment.manoeuvres
     if isinstance(manoeuvres, Mapping):
         tables = {name: _checked(name, table) for name, table in manoeuvres.items()}
     elif manoeuvres is not None:
@@ -123,11 +137,11 @@ def plan(
         tables = {name: tables[name] for name in manoeuvres}
     jobs: list[Job] = []
     session = 0.0
-    for replicate in range(1, replicates + 1):
+    for replicate in range(1, experiment.replicates + 1):
         for name, messages in tables.items():
             jobs.append(Job(f"{name}_{replicate}", len(jobs), messages, session))
             session += float(messages[-1, 0]) + 5.0
-    return Setting(active, seed, noise, chair), jobs
+    return Setting(active, seed, noise, chair, experiment.contact, experiment.gyro), jobs
 
 
 def _checked(name: str, table: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.plant.base import TICK
 from benchmarks.plant.draw import draw_effect
 from benchmarks.plant.effects import EFFECTS
-from benchmarks.plant.make import plan
+from benchmarks.plant.make import Experiment, plan
 from benchmarks.plant.online import OnlinePlant
 from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, EpisodeServer, number
@@ -38,8 +38,8 @@ STEP = 0.05
 
 A command counts from its stamp, and time waits for the command that is due. So the same manoeuvre is always the same
 commands."""
-PATIENCE = 1.0
-"""Seconds of the wall clock that simulated time waits for it."""
+PATIENCE = 5.0
+"""Seconds of the wall clock that simulated time waits for it: a busy computer may let a process wait for seconds."""
 BEAT = 0.1
 """Seconds between two messages of the emergency stop."""
 
@@ -65,7 +65,6 @@ class RobotNode:
         self._steps = 0
         self._last = -math.inf
         self.stopping = False
-        """Set to end `serve`."""
 
     @property
     def now(self) -> float:
@@ -103,15 +102,21 @@ class RobotNode:
             self.plant.command(t - self._base, message.twist.linear.x, message.twist.angular.z)
             self._changed.notify()
 
+    def stop(self) -> None:
+        """End `serve` soon, also where it waits for a driver."""
+        with self._changed:
+            self.stopping = True
+            self._changed.notify()
+
     def serve(self) -> None:
-        """Let time pass until `stopping` is set."""
+        """Let time pass until `stop` is called."""
         due = time.monotonic()
         while not self.stopping:
             due = max(due, time.monotonic() - STEP) + STEP / self.speed
             with self._changed:
                 last, until = self._last, time.monotonic() + PATIENCE
                 while self._last == last and self.now - last > STEP - 1e-6 and not self.stopping:
-                    if not self._changed.wait(max(until - time.monotonic(), 0.0)):
+                    if not self._changed.wait(max(until - time.monotonic(), 0.0)) and not self.stopping:
                         self._last = -math.inf
                         break
                 self._steps += 1
@@ -168,7 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
     effects = {} if options.draw is None else draw_effect(options.draw, options.effect)
     if options.answers:
         ros.write_json(options.answers, {"effects": effects, "seed": options.seed})
-    setting, _ = plan(effects, options.seed, options.noise, True)
+    setting, _ = plan(Experiment(effects, options.seed, options.noise, True))
     plant = OnlinePlant(setting)
     failures: list[ValueError] = []
     with ros.node_session("contact_plant", ros_arguments) as node:
@@ -185,7 +190,7 @@ def main(arguments: list[str] | None = None) -> int:
         thread.start()
         print(f"port {server.port}", flush=True)
         ros.spin(node, lambda: not thread.is_alive())
-        robot.stopping = True
+        robot.stop()
         thread.join(PATIENCE + 1)
         server.close()
     for failure in failures:

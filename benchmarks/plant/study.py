@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.plant.commands import nine
 from benchmarks.plant.compare import CHANNELS, drive_like, groups, read, spread
 from benchmarks.plant.effects import EFFECTS
-from benchmarks.plant.make import drive_all, plan
+from benchmarks.plant.make import Experiment, drive_all, plan
 from bridge.options import Parser, in_range
 from whill_mjx.io.command_line import guarded
 
@@ -26,7 +26,7 @@ def table_of(
     manoeuvres: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Channels (R, M, 8) of every manoeuvre, driven by the nominal chair with these effects; nothing is written."""
-    setting, jobs = plan(effects, seed, noise, False, manoeuvres or nine(seed), replicates)
+    setting, jobs = plan(Experiment(effects, seed, noise, False, manoeuvres or nine(seed), replicates))
     trials = {}
     for name, odometry, pose, _ in drive_all(setting, jobs):
         t = pose[:, 0]

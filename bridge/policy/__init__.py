@@ -10,17 +10,18 @@ from bridge.policy.contract import (
     SCHEMA,
     AgentContract,
     Contract,
-    Fields,
     Tensor,
     check_kind,
     parse_hashes,
     parse_observation,
 )
+from bridge.policy.fields import Fields
 from bridge.policy.parts import COPY_AGAIN, EXPORT_AGAIN, Parts, PolicyFileError, read_arrays, refusals, show
 from bridge.policy.run import CheckedPolicy, Policy, make_session, read_policy
+from bridge.policy.sensors import SensorInput, pacer_of
 
 __all__ = [
     "AGENT_KIND", "COPY_AGAIN", "EXPORT_AGAIN", "KIND", "SCHEMA", "AgentContract", "CheckedPolicy", "Contract",
-    "Fields", "Parts", "Policy", "PolicyFileError", "Tensor", "check_kind", "make_session", "parse_hashes",
-    "parse_observation", "read_arrays", "read_policy", "refusals", "show",
+    "Fields", "Parts", "Policy", "PolicyFileError", "SensorInput", "Tensor", "check_kind", "make_session",
+    "pacer_of", "parse_hashes", "parse_observation", "read_arrays", "read_policy", "refusals", "show",
 ]  # fmt: skip

@@ -3,10 +3,12 @@
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
+from bridge.policy.fields import Fields, is_integer, is_number, is_within
 from bridge.policy.parts import EXPORT_AGAIN, MAX_FILES, MIB, PolicyFileError, show
+from bridge.policy.sensors import SensorInput, parse_camera, parse_sensors
 
 SCHEMA = 1
 KIND = "micromobility-policy"
@@ -27,11 +29,6 @@ MAX_STATE_BYTES = 16 * MIB
 """Largest recurrent state [bytes]: it is copied in every step. Presets have less than 100 kB."""
 SURPRISE = "surprise"
 """Name of the carry that holds a running mean of how little the images agree with what was expected [nat]."""
-CAMERA_FRAMES = ("base_footprint", "chassis")
-"""Frames of the camera: `chassis` in files that name none."""
-CAMERA_RULES = {"x": (10.0, "m"), "y": (10.0, "m"), "z": (10.0, "m"), "roll": (math.pi, "rad"),
-                "pitch": (math.pi / 2, "rad"), "yaw": (math.pi, "rad"), "fov_y": (math.pi, "rad")}
-"""Largest size of each number of the camera, and its unit."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +73,16 @@ class Contract:
     novelty: tuple[float, float] | None = None
     """Surprise [nat] from which the vehicle slows down, and at which it stops; None where the file has no score."""
 
+    @property
+    def commands(self) -> "Commands":
+        """What the actions mean."""
+        return Commands(self.low, self.high, self.rate_hz, self.action_repeat)
+
+    @property
+    def sensors(self) -> dict[str, SensorInput]:
+        """The one sensor that it reads, its camera."""
+        return {"image": SensorInput("image", "camera", (self.height, self.width, 3), camera=self.camera)}
+
     def tensors(self) -> tuple[list[Tensor], list[Tensor]]:
         """Return the inputs and outputs that the network must have, in order."""
         image = Tensor("image", (self.height, self.width, 3), "uint8")
@@ -115,6 +122,10 @@ class AgentContract:
     """That it was trained for."""
     commands: Commands | None = None
     """Of an agent that drives a vehicle by other sensors than its camera alone."""
+    sensors: Mapping[str, SensorInput] = field(default_factory=dict)
+    """Of the observations by name; empty where the file does not say what measures them."""
+    novelty: None = None
+    """An agent's file has no score of its surroundings."""
 
     SINGLE = "observation"
 
@@ -143,9 +154,9 @@ def check_kind(name: str, table: Mapping[str, Any], kinds: tuple[str, ...]) -> s
     if schema == SCHEMA and kind == AGENT_KIND and AGENT_KIND not in kinds:
         seen = parse_observation(Fields(name, table))
         what = ", ".join(sorted(seen)) if isinstance(seen, dict) else f"one observation of shape {list(seen)}"
-        raise PolicyFileError(f"{name}: the policy is an agent that reads {what}; here a vehicle is driven by the "
-                              "camera image alone. Train with that observation, or run it with whill_mjx.evaluate or "
-                              "dreamer.policy.")
+        raise PolicyFileError(f"{name}: the policy is an agent that reads {what}; here a policy of the camera image "
+                              "alone is needed. Train with that observation, or run it with bridge.drive, "
+                              "whill_mjx.evaluate or dreamer.policy.")
     if schema != SCHEMA or isinstance(schema, bool) or kind not in kinds:
         wanted = " or ".join(repr(known) for known in kinds)
         raise PolicyFileError(f"{name}: schema {show(schema)} of kind {show(kind)}; this bridge reads schema {SCHEMA} "
@@ -176,7 +187,7 @@ def parse_contract(name: str, table: Mapping[str, Any]) -> Contract:
     return Contract(
         height=height, width=width, low=commands.low, high=commands.high, rate_hz=commands.rate_hz,
         action_repeat=commands.action_repeat, carry=carry, inputs=inputs, outputs=outputs,
-        camera=_parse_camera(fields.child("camera")),
+        camera=parse_camera(fields.child("camera")),
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text"),
         vehicle_sha256=fields.rule("vehicle_sha256", lambda value: value == "" or _is_digest(value),
                                    "must be empty or a SHA-256 (64 hexadecimal digits)"),
@@ -184,7 +195,7 @@ def parse_contract(name: str, table: Mapping[str, Any]) -> Contract:
     )
 
 
-def _parse_commands(fields: "Fields", action: "Fields") -> Commands:
+def _parse_commands(fields: Fields, action: Fields) -> Commands:
     """Return what actions mean, from the rates of a policy and its table of the action."""
     action.rule("names", lambda value: value == ["v", "omega"], "must be ['v', 'omega']")
     action.rule("units", lambda value: value == ["m/s", "rad/s"], "must be ['m/s', 'rad/s']")
@@ -218,38 +229,15 @@ def parse_agent(name: str, table: Mapping[str, Any]) -> AgentContract:
         observation=observation, discrete=kind == "discrete", size=size, carry=carry, inputs=inputs, outputs=outputs,
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text") if "task" in table else "",
         commands=_parse_commands(fields, action) if "low" in action.table and size == 2 and kind == "box" else None,
+        sensors=parse_sensors(fields, observation if isinstance(observation, dict) else {seen[0]: observation}),
     )
 
 
-def parse_observation(fields: "Fields") -> tuple[int, ...] | dict[str, tuple[int, ...]]:
+def parse_observation(fields: Fields) -> tuple[int, ...] | dict[str, tuple[int, ...]]:
     """Return the shape of the one observation, or the shapes by name."""
     value = fields.rule("observation", _is_observation, "must be a shape [H, W, C] or [D], or several by name, of at "
                         f"most {16 * MAX_PIXELS} numbers in all")
     return {key: tuple(shape) for key, shape in value.items()} if isinstance(value, dict) else tuple(value)
-
-
-class Fields:
-    """A JSON object whose fields are read together with their rule."""
-
-    def __init__(self, name: str, table: Any) -> None:
-        self.name, self.table = name, table
-        if not isinstance(table, Mapping):
-            raise PolicyFileError(f"{name}: is {show(table)}; it must be a JSON object. {EXPORT_AGAIN}.")
-
-    def child(self, key: str) -> "Fields":
-        """Return the object in a field."""
-        return Fields(f"{self.name} {key}", self.table.get(key))
-
-    def rule(self, key: str, holds: Callable[[Any], bool], text: str) -> Any:
-        """Return the value of a field that keeps its rule.
-
-        Raises:
-            PolicyFileError: it does not; names the file, the field, the value, the rule and the remedy.
-        """
-        value = self.table.get(key)
-        if not holds(value):
-            raise PolicyFileError(f"{self.name}: {key} = {show(value)}, but it {text}. {EXPORT_AGAIN}.")
-        return value
 
 
 def _parse_carry(fields: Fields) -> tuple[Tensor, ...]:
@@ -295,39 +283,8 @@ def _parse_tensors(fields: Fields, inputs: int, outputs: int) -> tuple[tuple[str
     return tuple(names[0]), tuple(names[1])
 
 
-def _parse_camera(camera: Fields) -> dict[str, Any]:
-    """Return the camera with its frame; fields of other names are free."""
-    frame = "chassis" if "frame" not in camera.table else camera.rule(
-        "frame", lambda value: value in CAMERA_FRAMES, f"must be one of {list(CAMERA_FRAMES)}")
-    for key, (limit, unit) in CAMERA_RULES.items():
-        if key in camera.table:
-            camera.rule(key, _is_within(limit), f"must be a number from {-limit:g} to {limit:g} [{unit}]")
-    if "fov_y" in camera.table:
-        camera.rule("fov_y", lambda value: value > 0, "must be above 0 rad: it is an angle of view")
-    return {**camera.table, "frame": frame}
-
-
-def is_integer(value: Any) -> bool:
-    """Return whether a value is an integer and no truth value."""
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def is_number(value: Any) -> bool:
-    """Return whether a value is a finite number; an integer too long for a float is none."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
-
-
-def _is_within(limit: float) -> Callable[[Any], bool]:
-    return lambda value: is_number(value) and abs(value) <= limit
-
-
 def _is_pair(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_is_within(MAX_SPEED), value))
+    return isinstance(value, list) and len(value) == 2 and all(map(is_within(MAX_SPEED), value))
 
 
 def _is_side(value: Any) -> bool:

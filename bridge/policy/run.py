@@ -19,6 +19,7 @@ from bridge.policy.contract import (
     parse_hashes,
 )
 from bridge.policy.parts import COPY_AGAIN, EXPORT_AGAIN, TABLE, Parts, PolicyFileError
+from bridge.policy.sensors import SHAPES, SensorInput, pacer_of
 from bridge.policy.trial import Trial
 
 ZIP_STARTS = (b"PK\x03\x04", b"PK\x05\x06")
@@ -84,14 +85,23 @@ def make_session(policy: CheckedPolicy) -> Any:
 
 
 class Policy:
-    """A recurrent policy. `step` maps one image to one command and advances the state."""
+    """A recurrent policy of a vehicle. `step` maps what its sensors show to one command and advances the state."""
 
-    def __init__(self, contract: Contract, session: Any, name: str = "policy") -> None:
-        self.contract = contract
-        self.name = name
+    def __init__(self, contract: Contract | AgentContract, session: Any, name: str = "policy") -> None:
+        """Prepare a policy whose contract says what its actions and observations are."""
+        commands, pacer = contract.commands, pacer_of(contract.sensors)
+        assert commands is not None and pacer is not None
+        self.contract, self.commands, self.sensors, self.name = contract, commands, contract.sensors, name
+        self.pacer: SensorInput = pacer
+        """The sensor whose messages make a step."""
         self._session = session
-        self._low = np.array(contract.low)
-        self._span = np.array(contract.high) - self._low
+        self._low = np.array(commands.low)
+        self._span = np.array(commands.high) - self._low
+        inputs, _ = contract.tensors()
+        agent = isinstance(contract, AgentContract)
+        self._state_names = [f"carry_{one.name}" for one in contract.carry] if agent else list(contract.inputs[1:])
+        self._inputs = {one.name: one for one in inputs if one.name not in self._state_names}
+        self._alone = next(iter(self._inputs)) if len(self._inputs) == 1 else ""
         self.reset()
 
     @classmethod
@@ -101,11 +111,11 @@ class Policy:
         Raises:
             PolicyFileError: with the file, the field, the value, the rule and the remedy.
         """
-        checked = read_policy(path)
+        checked = read_policy(path, (KIND, AGENT_KIND))
         contract = checked.contract
-        assert isinstance(contract, Contract)
+        _check_drives(f"{path}/{TABLE}", contract)
         policy = cls(contract, make_session(checked), str(path))
-        policy.step(np.zeros((contract.height, contract.width, 3), np.uint8))  # the first step takes longest
+        policy.step(policy.zeros())  # the first step takes longest
         policy.reset()
         return policy
 
@@ -113,20 +123,27 @@ class Policy:
         """Forget everything seen: the zero state is the start of an episode."""
         self._carry = [np.zeros(spec.shape, spec.dtype) for spec in self.contract.carry]
 
-    def step(self, image: np.ndarray) -> np.ndarray:
-        """Return the command (2,): v [m/s], omega [rad/s], for an image (H, W, 3) uint8 rgb8.
+    def zeros(self) -> dict[str, np.ndarray]:
+        """Return observations of zeros, by the names of the network's inputs."""
+        return {name: np.zeros(one.shape, one.dtype) for name, one in self._inputs.items()}
+
+    def step(self, seen: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the command (2,): v [m/s], omega [rad/s], for an image (H, W, 3) uint8 rgb8, or observations by name.
 
         The command is not limited here (bridge/safety.py does), and it is NaN where the action or the new state is
         not finite: a spoilt state must never hide behind a finite action.
 
         Raises:
-            ValueError: the image has another shape or dtype than the policy was trained with.
+            ValueError: an observation is missing or has another shape or dtype than the policy was trained with.
         """
-        want = (self.contract.height, self.contract.width, 3)
-        if image.shape != want or image.dtype != np.uint8:
-            raise ValueError(f"{self.name}: image {image.shape} {image.dtype}; the policy needs {want} uint8 rgb8. "
-                             "Convert it with bridge.image.to_rgb8.")
-        feed = dict(zip(self.contract.inputs, [image, *self._carry], strict=True))
+        given: dict[str, Any] = {self._alone: seen} if isinstance(seen, np.ndarray) else dict(seen)
+        for name, want in self._inputs.items():
+            value = given.get(name)
+            if value is None or value.shape != want.shape or value.dtype != want.dtype:
+                found = "none" if value is None else f"{value.shape} {value.dtype}"
+                raise ValueError(f"{self.name}: {name} is {found}; the policy needs {want.shape} {want.dtype}. Convert "
+                                 "it (an image: bridge.image.to_rgb8).")
+        feed = {name: given[name] for name in self._inputs} | dict(zip(self._state_names, self._carry, strict=True))
         action, *self._carry = self._session.run(list(self.contract.outputs), feed)
         if not all(np.isfinite(value).all() for value in self._carry if value.dtype.kind == "f"):
             return np.full(2, np.nan)
@@ -143,6 +160,24 @@ class Policy:
             if spec.name == SURPRISE:
                 return float(np.mean(value))
         return float("nan")
+
+
+def _check_drives(name: str, contract: Contract | AgentContract) -> None:
+    """Raise where a policy drives no vehicle, or by what no vehicle of the bridge measures."""
+    if contract.commands is None:
+        raise PolicyFileError(f"{name}: the agent drives no vehicle: its action has no low and high of v and omega. "
+                              "Run it with dreamer.policy.")
+    if not contract.sensors:
+        names = contract.inputs[: len(contract.inputs) - len(contract.carry)]
+        raise PolicyFileError(f"{name}: has no field sensors, which says what measures {', '.join(sorted(names))}. "
+                              f"{EXPORT_AGAIN}.")
+    for one in contract.sensors.values():
+        if one.kind not in SHAPES:
+            raise PolicyFileError(f"{name}: sensors {one.name}: kind = {one.kind!r}, which no vehicle of this bridge "
+                                  f"measures (it reads {', '.join(SHAPES)}). Train with those.")
+    if pacer_of(contract.sensors) is None:
+        raise PolicyFileError(f"{name}: sensors = {sorted(contract.sensors)}: none of them gives a policy its pace. "
+                              "Train with a camera, a lidar or odometry too.")
 
 
 def _check_archive(parts: Parts, hashes: Mapping[str, str]) -> None:

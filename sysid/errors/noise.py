@@ -46,6 +46,10 @@ class Whitener:
             white = added(white, np.s_[:, lag:], -xp.einsum("ij,bkj...->bki...", matrix, scaled[:, :-lag]))
         return xp.einsum("ij,bkj...->bki...", self.inverse, white * (shown > 0))
 
+    def flat(self, series: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """The same flat, (B, K C, ...)."""
+        return self.apply(series, mask).reshape(len(mask), -1, *series.shape[3:])
+
     def scaled(self, factor: float | np.ndarray) -> Whitener:
         """The filter for noise that is larger by a factor, () or (C,)."""
         return Whitener(self.scale * factor, self.coefficients, self.inverse)

@@ -68,7 +68,7 @@ def estimate_noise(trials: tuple[Trial, ...]) -> Noise:
     return Noise(pose, odometry, "replicates", gyro)
 
 
-class Told(Residuals, Protocol):
+class DriveResiduals(Residuals, Protocol):
     """`Objective`, or `sysid.errors.bin_objective.FeatureObjective`: residuals (N, B, K) of B trials."""
 
     @property
@@ -378,7 +378,7 @@ class _StartError:
         return moved.reshape(*error.shape[:2], -1, error.shape[3])
 
 
-def without_prior(objective: Told, table: np.ndarray) -> np.ndarray:
+def without_prior(objective: DriveResiduals, table: np.ndarray) -> np.ndarray:
     """Table (B, K, ...) of the measurements alone."""
     return table if objective.prior is None else table[:, : -objective.space.size]
 

@@ -21,9 +21,7 @@ import numpy as np
 from sysid.logs.manoeuvre_library import OWN, REVERSING, make_command
 from sysid.logs.metrics import ideal_replay
 from sysid.logs.records import Command, GyroStream, OdometryStream, PoseStream, Start, Trial
-from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.drives import Drives
-from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit
 from sysid.missing.joint_fit import Start as FitStart
 from sysid.missing.refit import Refitter, own_sizes
@@ -52,7 +50,7 @@ POLISH = 3  # iterations of the refit of a rival that the search has not refitte
 
 
 @dataclass(frozen=True)
-class Drive:
+class PlannedDrive:
     """One drive of the library: a manoeuvre and how it is driven."""
 
     manoeuvre: str
@@ -88,8 +86,8 @@ def next_manoeuvre(result: Result) -> dict[str, Any] | None:
         `name`, `parameters` {v [m/s], omega [rad/s], seconds, dt [s]} and `start` {x, y [m], heading [rad]} of the
         drive, `splits` (the effects that it separates), `expected_separation` (standard deviations, the worst pair of
         these, one drive), `replicates` (drives after which that is `ENOUGH`), `file`, and `not_split`: pairs of effects
-        that no drive separates, with the best `separation` and the `sensor` that would. Where no drive tells
-        anything, name, parameters, start and file are None.
+        that no drive separates, with the best `separation` and the `sensor` that would. Where no drive separates
+        any of them, name, parameters, start and file are None.
     """
     rounds = rivals_of(result)
     if not rounds:
@@ -134,7 +132,7 @@ def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[
     return [Rival(name, more[name] if fit is None else fit) for name, fit in rivals]
 
 
-def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[Drive]:
+def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[PlannedDrive]:
     """The library: every manoeuvre at several sizes and start headings [degrees], within the speeds, the space and the
     time that the training trials took up."""
     trials = result.log.training
@@ -144,15 +142,15 @@ def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[
     steps = np.concatenate([np.diff(trial.command.t) for trial in trials])
     dt = round(float(np.clip(np.median(steps), 0.02, 0.2)), 3)
     low, high = _space(trials)
-    found: dict[tuple[Any, ...], Drive] = {}
+    found: dict[tuple[Any, ...], PlannedDrive] = {}
     for name in (*MANOEUVRES, *OWN):
         for size in SIZES if name != "standstill" else SIZES[:1]:
             speed = min(size * v, -result.log.spec.v_min) if name in REVERSING else size * v
             if speed < 0.02:
                 continue
             for heading in headings:
-                whole = Drive(name, speed, size * omega, longest - 2 * STANDSTILL, (0.0, 0.0, math.radians(heading)),
-                              dt)
+                start = (0.0, 0.0, math.radians(heading))
+                whole = PlannedDrive(name, speed, size * omega, longest - 2 * STANDSTILL, start, dt)
                 drive = _fitting(whole, low, high, longest)
                 if drive is not None:
                     command = drive.command
@@ -172,7 +170,7 @@ def _space(trials: Sequence[Trial]) -> tuple[np.ndarray, np.ndarray]:
     return points.min(0), points.max(0)
 
 
-def _fitting(whole: Drive, low: np.ndarray, high: np.ndarray, longest: float) -> Drive | None:
+def _fitting(whole: PlannedDrive, low: np.ndarray, high: np.ndarray, longest: float) -> PlannedDrive | None:
     """A manoeuvre as long as time and space allow, placed in the middle of the space; None where none fits."""
     heading = whole.start[2]
     for fraction in FRACTIONS:
@@ -198,7 +196,7 @@ def _as_trial(command: Command, start: Start, duration: float, poses: int, readi
     return Trial("next", "next", command, odometry, truth, start, gyro=turn)
 
 
-def plan_drives(result: Result, drives: Drives, library: Sequence[Drive]) -> Drives:
+def plan_drives(result: Result, drives: Drives, library: Sequence[PlannedDrive]) -> Drives:
     """Drives of the library, sampled like the log's longest trial, through the same compiled replay."""
     trials = result.log.training
     longest = max(trial.duration for trial in trials)
@@ -217,8 +215,8 @@ def plan_drives(result: Result, drives: Drives, library: Sequence[Drive]) -> Dri
 
 
 def separations(
-    result: Result, refitter: Refitter, groups: Sequence[Sequence[Rival]], library: Sequence[Drive]
-) -> tuple[np.ndarray, list[Drive]]:
+    result: Result, refitter: Refitter, groups: Sequence[Sequence[Rival]], library: Sequence[PlannedDrive]
+) -> tuple[np.ndarray, list[PlannedDrive]]:
     """Separation (D, pairs) of the most promising drives, and these drives; pairs as in `itertools.combinations` of
     each group in turn."""
     flat = [one for group in groups for one in group]
@@ -229,8 +227,9 @@ def separations(
     best = np.unique(np.argsort(-raw, axis=0)[: max(REFINED // len(pairs), 4)])  # each pair's own best
     chosen = [library[i] for i in best]
     seen, drives = _seen(result, refitter, flat, chosen)
-    base = _white(result, drives, base_columns(drives, result.reference, refitter.values, result.names))
-    columns = [np.concatenate([base, _own_columns(result, drives, one.fit, seen[i])], axis=-1)
+    white = result.reference.whitener.flat
+    base = white(base_columns(drives, result.reference, refitter.values, result.names), drives.mask)
+    columns = [np.concatenate([base, _own_columns(refitter, drives, one.fit, seen[i])], axis=-1)
                for i, one in enumerate(flat)]
     held = [_held(result, one.fit) for one in flat]
     inflation = math.sqrt(1 + max(result.search.excess[1], 0.0))
@@ -250,37 +249,21 @@ def absorbed(difference: np.ndarray, columns: np.ndarray, held: np.ndarray) -> f
     return math.sqrt(max(float(difference @ difference - moments @ np.linalg.solve(matrix, moments)), 0.0))
 
 
-def _seen(result: Result, refitter: Refitter, rivals: Sequence[Rival], library: Sequence[Drive]
+def _seen(result: Result, refitter: Refitter, rivals: Sequence[Rival], library: Sequence[PlannedDrive]
           ) -> tuple[np.ndarray, Drives]:
     """White features (rivals, D, n) of each rival on each drive."""
     drives = plan_drives(result, refitter.drives, library)
     features = drives.simulate(np.stack([one.fit.values for one in rivals]))
     drives = drives.weighted(features[0], result.reference.factors, result.log.spec.track)
-    return np.stack([_white(result, drives, one) for one in features]), drives
+    return np.stack([result.reference.whitener.flat(one, drives.mask) for one in features]), drives
 
 
-def _white(result: Result, drives: Drives, series: np.ndarray) -> np.ndarray:
-    """(D, n, ...) white and flat, of (D, K, C, ...)."""
-    white = result.reference.whitener.apply(series, drives.mask)
-    return white.reshape(len(white), -1, *series.shape[3:])
-
-
-def _own_columns(result: Result, drives: Drives, fit: Refit, at: np.ndarray) -> np.ndarray:
+def _own_columns(refitter: Refitter, drives: Drives, fit: Refit, at: np.ndarray) -> np.ndarray:
     """(D, n, k) derivative of the white features by a rival's own coordinates, by differences."""
     own = Quotients.forward(fit.q, own_sizes(fit.q))
-    seen = drives.simulate(np.stack([_values(result, fit.hypotheses, fit.u, q) for q in own.above]))
-    return np.asarray(own.slopes(np.stack([_white(result, drives, one) for one in seen]), at))
-
-
-def _values(result: Result, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """All parameters of the vehicle at base coordinates u (P,) and the hypotheses' own q (k,)."""
-    base = base_values(result.full)
-    base.update(zip(result.reference.space.names, result.reference.space.to_values(u).tolist(), strict=True))
-    values = np.array([base[name] for name in result.names])
-    parts = np.split(q, np.cumsum([len(one.axes) for one in hypotheses])[:-1])
-    for one, part in zip(hypotheses, parts, strict=True):
-        values = with_values(values, result.names, one.values(part, base))
-    return values
+    seen = drives.simulate(np.stack([refitter.values_at(fit.hypotheses, fit.u, q) for q in own.above]))
+    white = refitter.reference.whitener.flat
+    return np.asarray(own.slopes(np.stack([white(one, drives.mask) for one in seen]), at))
 
 
 def _held(result: Result, fit: Refit) -> np.ndarray:
@@ -304,7 +287,8 @@ def _held(result: Result, fit: Refit) -> np.ndarray:
     return out
 
 
-def _proposal(pairs: Sequence[tuple[Rival, Rival]], separation: np.ndarray, library: Sequence[Drive]) -> dict[str, Any]:
+def _proposal(pairs: Sequence[tuple[Rival, Rival]], separation: np.ndarray, library: Sequence[PlannedDrive]
+              ) -> dict[str, Any]:
     """The drive with the largest worst case over the pairs that any drive separates."""
     reach = separation.max(0)
     separable = reach >= LEAST

@@ -16,7 +16,7 @@ from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander
 from sysid.missing.evidence import Columns, Evidence, Solver
 from sysid.verdict.found import Scan, family, tail
-from sysid.verdict.scan import look, null_moments
+from sysid.verdict.scan import NullDays, look
 
 DRAWS = 200
 SEED = 3  # beside that of the scan's nulls
@@ -38,18 +38,18 @@ class Days:
     hypotheses: Sequence[Hypothesis]
     wander: Wander
     scan: Scan
-    moments: np.ndarray  # (N, P + S)
-    share: np.ndarray  # (N, D) in which the reference days' apparent effects are in them
+    """That was run on this evidence."""
+    nulls: NullDays
 
     def p(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """(E, N) p-values of "nothing is missing", with one of the effects in every day; (1, N) of the days alone."""
-        products, draws = self.evidence.products.sum(0), len(self.moments)
+        products, draws = self.evidence.products.sum(0), len(self.nulls.moments)
         added = np.stack([products[:, list(columns.index)] @ q for columns, q in effects]) if effects else np.zeros(
             (1, len(products)))
-        moments = (added[:, None] + self.moments).reshape(-1, len(products))
+        moments = (added[:, None] + self.nulls.moments).reshape(-1, len(products))
         solver, worth = Solver(self.evidence), np.zeros((len(moments), len(self.hypotheses)))
         for number, (one, covariance) in enumerate(zip(self.evidence.columns, self.wander.covariance, strict=True)):
-            away = np.tile(self.wander.away(number, self.share), (len(added), 1))
+            away = np.tile(self.wander.away(number, self.nulls.share), (len(added), 1))
             found = look(solver, one, self.hypotheses[one.hypothesis].axes, covariance, moments, away)
             worth[:, one.hypothesis] = np.maximum(worth[:, one.hypothesis], found.worth)
         each = np.stack([tail(self.scan.null[:, h], worth[:, h]) for h in range(len(self.hypotheses))], axis=-1)
@@ -63,22 +63,6 @@ class Days:
         """The columns of a hypothesis that were simulated nearest to a size."""
         mine = [one for one in self.evidence.columns if one.hypothesis == hypothesis]
         return min(mine, key=lambda one: abs(one.level - size))
-
-
-def simulated_days(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, scan: Scan,
-    draws: int = DRAWS, seed: int = 0,
-) -> Days:
-    """Draw days anew.
-
-    Args:
-        evidence: that the scan was run on.
-        spread: (P, P) day-to-day covariance of the base parameters.
-    """
-    rng = np.random.default_rng((seed, SEED))
-    moments = null_moments(evidence, spread, draws, rng)
-    share = wander.draw_shares(draws, rng)
-    return Days(evidence, hypotheses, wander, scan, moments, share)
 
 
 def false_alarms(days: Days, alpha: float) -> dict[str, float]:

@@ -16,9 +16,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.follow_up.tables import (
+from sysid.follow_up.wrench_tables import (
     Products,
-    Table,
+    WrenchTable,
     few_terms,
     from_first_wave,
     held_back,
@@ -26,13 +26,13 @@ from sysid.follow_up.tables import (
     penalties,
     turned,
 )
-from sysid.follow_up.terms import Term, columns_of, in_words
+from sysid.follow_up.wrench_terms import Term, columns_of, in_words
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.replay.models import with_effects
 from sysid.replay.quotients import Quotients
-from sysid.replay.records import Plant
+from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from sysid.verdict.result import Result
@@ -59,10 +59,10 @@ ROUNDS = 3  # Gauss-Newton steps
 
 
 @dataclass(frozen=True)
-class Fit:
+class TableFit:
     """A table fitted to all trials by regression."""
 
-    table: Table
+    table: WrenchTable
     gains: np.ndarray  # (G,) on each manoeuvre, held back
     smoothing: float
     products: Products
@@ -74,7 +74,7 @@ class Fit:
 class Unnamed:
     """A fitted wrench."""
 
-    table: Table
+    table: WrenchTable
     wrench: np.ndarray  # (2 KNOTS,) forces [N], then torques [N m]
     terms: tuple[Term, ...]
     """The sum that stands for the tables; none where no compact one does."""
@@ -94,7 +94,7 @@ class Unnamed:
     kept: bool
 
 
-class Bench:
+class UnnamedReplays:
     """Replays of the base model with the effect `unnamed` in it."""
 
     def __init__(self, result: Result):
@@ -104,16 +104,16 @@ class Bench:
         self.names = [name for name in describe(self.params) if name.startswith("unnamed.")] + self.base_names
         self.neutral = np.asarray(get_values(self.params, self.names), float)
         self.u = base.u
-        drives = make_drives(result.plant, self.params, self.names, result.log.training, reference.width,
-                             gyro=reference.gyro)
+        drives = make_drives(FreeVehicle(result.plant, self.params, tuple(self.names)), result.log.training,
+                             reference.width, gyro=reference.gyro)
         self.drives = drives.weighted(drives.simulate(self.neutral[None])[0], reference.factors, result.log.spec.track)
         weight = 0.01 * result.log.spec.mass * 9.81
         self.sizes = np.repeat([weight, weight * result.log.spec.track / 2], KNOTS)  # N, N m
         self.target = self.white(self.drives, reference.target_of(self.drives))
         self.target_shape = self.drives.target.shape
 
-    def values(self, u: np.ndarray, table: Table | None = None, wrench: np.ndarray | None = None, start: float = 0.0
-               ) -> np.ndarray:
+    def values(self, u: np.ndarray, table: WrenchTable | None = None, wrench: np.ndarray | None = None,
+               start: float = 0.0) -> np.ndarray:
         """All replayed parameters at base coordinates and a table."""
         out = self.neutral.copy()
         out[len(out) - len(u) :] = self.result.reference.space.to_values(u)
@@ -124,10 +124,10 @@ class Bench:
 
     def white(self, drives: Drives, series: np.ndarray) -> np.ndarray:
         """(B, n, ...) white and flat, of (B, K, C, ...)."""
-        white = self.result.reference.whitener.apply(series, drives.mask)
-        return white.reshape(len(white), -1, *series.shape[3:])
+        return self.result.reference.whitener.flat(series, drives.mask)
 
-    def residual(self, points: Sequence[tuple[np.ndarray, np.ndarray]], table: Table, phases: np.ndarray) -> np.ndarray:
+    def residual(self, points: Sequence[tuple[np.ndarray, np.ndarray]], table: WrenchTable, phases: np.ndarray
+                 ) -> np.ndarray:
         """(N, B, n) white residual of all training trials at base coordinates and wrenches, with each trial's turn."""
         turns = sorted(set(phases.tolist()))
         sets = [self.values(u, table, wrench, float(PHASES[turn])) for u, wrench in points for turn in turns]
@@ -141,7 +141,7 @@ class Bench:
         bins = chosen.features.mask.shape[1]
         return replace(chosen, weight=self.drives.mask[list(trials), :bins])
 
-    def columns(self, table: Table, trials: Sequence[int]) -> np.ndarray:
+    def columns(self, table: WrenchTable, trials: Sequence[int]) -> np.ndarray:
         """(b, n, 2 KNOTS) change of the white features by each knot, per N and N m."""
         drives = self.part(trials)
         own = Quotients.forward(np.zeros(2 * KNOTS), self.sizes)
@@ -161,7 +161,7 @@ def find_unnamed(result: Result) -> Unnamed | None:
 
     if result.search.verdict != "unexplained":
         return None
-    found = fit_unnamed(Bench(result))
+    found = fit_unnamed(UnnamedReplays(result))
     if not found.kept or not result.config.poses:
         return found
     if found.table.quantity in WHEELS:
@@ -189,7 +189,7 @@ def with_start_angles(plant: Plant, trials: Sequence[Trial], angles: np.ndarray)
     return replace(plant, place=place)
 
 
-def fit_unnamed(bench: Bench) -> Unnamed:
+def fit_unnamed(bench: UnnamedReplays) -> Unnamed:
     """The same of any residual, before that refit."""
     result = bench.result
     groups = [list(group) for group in result.evidence.groups]
@@ -213,7 +213,7 @@ def fit_unnamed(bench: Bench) -> Unnamed:
         products = multiplied(residual, jacobian, columns, groups)
         gains, smoothing = held_back(products, result.evidence.precision, table)
         gains = gains - price(table, groups)
-        fitted.append(Fit(table, gains, smoothing, products, columns, phases))
+        fitted.append(TableFit(table, gains, smoothing, products, columns, phases))
     best = max(fitted, key=lambda one: float(one.gains.sum()))
     excess = max(result.search.excess[0], 1e-9) * float((bench.drives.mask > 0).sum())
     tried = [(one.table.quantity, one.table.kind, float(one.gains.sum()) / excess) for one in fitted]
@@ -221,7 +221,7 @@ def fit_unnamed(bench: Bench) -> Unnamed:
     return _replayed(bench, best, groups, excess, tuple(sorted(tried, key=lambda one: -one[2])))
 
 
-def tables(result: Result) -> list[Table]:
+def tables(result: Result) -> list[WrenchTable]:
     """All wrenches that are tried, with the range that the drives cover."""
     trials = result.log.training
     speeds = [trial.odometry.v if trial.odometry is not None else trial.command.v for trial in trials]
@@ -235,7 +235,7 @@ def tables(result: Result) -> list[Table]:
     if seen:
         ranges |= {"x in the room": places[0], "y in the room": places[1], MAP: (*places[0], *places[1])}
     found = [name for name in QUANTITIES if name not in ROOM or seen]
-    return [Table(name, kind, *ranges.get(name, (0.0, 1.0))) for name in found for kind in KINDS]
+    return [WrenchTable(name, kind, *ranges.get(name, (0.0, 1.0))) for name in found for kind in KINDS]
 
 
 def _range(series: np.ndarray) -> tuple[float, float]:
@@ -244,7 +244,7 @@ def _range(series: np.ndarray) -> tuple[float, float]:
     return float(low), float(max(high, low + 0.05))
 
 
-def price(table: Table, groups: Sequence[Sequence[int]]) -> np.ndarray:
+def price(table: WrenchTable, groups: Sequence[Sequence[int]]) -> np.ndarray:
     """(G,) what the trials of each group gain by a start angle of their own even where there is nothing."""
     return np.array([ANGLE_PRICE * len(group) for group in groups]) * (table.quantity in WHEELS)
 
@@ -256,7 +256,8 @@ def _positions(groups: Sequence[Sequence[int]]) -> list[list[int]]:
 
 
 def _replayed(
-    bench: Bench, best: Fit, groups: Sequence[Sequence[int]], excess: float, tried: tuple[tuple[str, str, float], ...]
+    bench: UnnamedReplays, best: TableFit, groups: Sequence[Sequence[int]], excess: float,
+    tried: tuple[tuple[str, str, float], ...],
 ) -> Unnamed:
     """The best table, or the few terms that stand for it, brought to its optimum by replays."""
     result, precision, table = bench.result, bench.result.evidence.precision, best.table

@@ -34,7 +34,7 @@ FLIPS, AT_ONCE = 999, 2**22  # draws of the signs of blocks; numbers that are dr
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Information:
     """Information of a log at a fitted point: sums over K pieces of each of B trials, in P unit coordinates."""
 
     u: np.ndarray  # (P,)
@@ -64,7 +64,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Errors:
+class StandardErrors:
     """Of P estimates, in unit coordinates."""
 
     deviation: np.ndarray  # (P,) standard errors
@@ -94,7 +94,7 @@ class Kind:
         return (self.sandwich.informed > 0.5) & (self.sandwich.freedom >= ENOUGH)
 
 
-def errors_of(evidence: Evidence, confidence: float = CONFIDENCE) -> Errors:
+def errors_of(evidence: Information, confidence: float = CONFIDENCE) -> StandardErrors:
     """The errors of estimates."""
     hessian, inverse = evidence.blocks.sum((0, 1)), evidence.inverse
     independent = np.sqrt(np.diag(inverse @ hessian @ inverse) * evidence.variance)
@@ -111,7 +111,8 @@ def errors_of(evidence: Evidence, confidence: float = CONFIDENCE) -> Errors:
             needed = np.where(kind.counts | (name == "pieces"), np.maximum(needed, share), needed)
     known = inverse @ evidence.precision @ inverse * evidence.share  # what the prior's own error adds
     covariances = [kind.sandwich.covariance(kind.sums(evidence.scores[None])[0]) for kind in kinds.values()]
-    return Errors(np.sqrt(deviation**2 + np.diag(known)), needed * quantile, max(covariances, key=np.trace) + known)
+    return StandardErrors(np.sqrt(deviation**2 + np.diag(known)), needed * quantile,
+                          max(covariances, key=np.trace) + known)
 
 
 def shared_error(series: np.ndarray, groups: np.ndarray) -> float:
@@ -133,7 +134,7 @@ def shared_error(series: np.ndarray, groups: np.ndarray) -> float:
     return float((1 + (drawn >= pairs.sum()).sum()) / (1 + FLIPS))
 
 
-def _kinds(evidence: Evidence, inverse: np.ndarray) -> dict[str, Kind]:
+def _kinds(evidence: Information, inverse: np.ndarray) -> dict[str, Kind]:
     """All that blocks may be: manoeuvres where the model is wrong about them, places where there are replicates."""
     trials, pieces = evidence.scores.shape[:2]
     piece = np.arange(pieces)
@@ -176,7 +177,7 @@ def _widest(
 
 
 def _flipped(
-    evidence: Evidence, kind: Kind, inverse: np.ndarray, random: np.random.Generator
+    evidence: Information, kind: Kind, inverse: np.ndarray, random: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """How far estimates are off (N, P), and scores (N, B, K, P) there, with the signs of blocks at random; some of
     `FLIPS` at a time. Errors are residuals as the sandwich corrects them."""

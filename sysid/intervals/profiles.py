@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.errors.pose_objective import Told
+from sysid.errors.pose_objective import DriveResiduals
 from sysid.errors.robust import robust_cost
 from sysid.errors.space import Space
 from sysid.intervals.uncertainty import Uncertainty
@@ -72,7 +72,7 @@ class Minimum:
 
 
 def profile(
-    objective: Told, at: Minimum, names: Sequence[str], *, points: int = POINTS, iterations: int = ITERATIONS,
+    objective: DriveResiduals, at: Minimum, names: Sequence[str], *, points: int = POINTS, iterations: int = ITERATIONS,
     progress: Progress | None = None,
 ) -> list[Profile]:
     """Profile likelihoods at the fitted point, all points of a grid searched together.
@@ -100,7 +100,7 @@ def profile(
         slope = known.covariance[:, index] / max(known.covariance[index, index], 1e-16)
         starts = np.clip(space.moved(np.tile(u, (len(grid), 1)), (grid - u[index])[:, None] * slope), 0.0, 1.0)
         starts[:, index] = grid
-        result = least_squares.fit(objective, space, starts=starts, iterations=iterations, robust=robust,
+        result = least_squares.fit(objective, starts=starts, stop=least_squares.Stopping(iterations), robust=robust,
                                    frozen=(name,), progress=progress)
         order = np.argsort(result.starts[:, index])
         cost = np.minimum(result.start_costs[order], np.where(np.isclose(grid, u[index], atol=1e-9), best, np.inf))
@@ -139,7 +139,7 @@ def crossings(values: np.ndarray, statistic: np.ndarray, threshold: float) -> tu
     return cross(range(middle - 1, -1, -1)), cross(range(middle + 1, len(values)))
 
 
-def _scale(objective: Told, u: np.ndarray, known: Uncertainty, sd: np.ndarray) -> np.ndarray:
+def _scale(objective: DriveResiduals, u: np.ndarray, known: Uncertainty, sd: np.ndarray) -> np.ndarray:
     """(P,) by how much squares over-count: sandwich variance over that of independent residuals of variance 1."""
     _, jacobian = (array[0] for array in objective.jacobian(u[None]))
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)

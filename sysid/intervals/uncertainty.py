@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.errors.pose_objective import Told, without_prior
+from sysid.errors.pose_objective import DriveResiduals, without_prior
 from sysid.errors.prior import UNKNOWN, expected_sd
 from sysid.errors.robust import HUBER, huber_weight, robust_cost
 from sysid.errors.space import BENT, NUISANCE, TERMS, Space
-from sysid.intervals.independence import CONFIDENCE, Evidence, errors_of, shared_error
+from sysid.intervals.independence import CONFIDENCE, Information, errors_of, shared_error
 from sysid.logs.metrics import replicate_groups
 from sysid.search import least_squares
 from sysid.search.slopes import average_slopes, likely, likely_by
@@ -66,7 +66,7 @@ class Uncertainty:
     covariance: np.ndarray  # (P, P) in unit coordinates
     deviation: np.ndarray  # (P,) standard errors in unit coordinates
     quantile: np.ndarray  # (P,) standard errors that the intervals reach on either side
-    evidence: Evidence
+    evidence: Information
 
     def spectrum(self) -> list[tuple[float, str]]:
         """Fisher information along each of its eigenvectors, weakest first, with the parameters that make it up."""
@@ -83,7 +83,7 @@ class Uncertainty:
 
 
 def estimate(
-    objective: Told, u: np.ndarray, confidence: float = CONFIDENCE, robust: bool = False
+    objective: DriveResiduals, u: np.ndarray, confidence: float = CONFIDENCE, robust: bool = False
 ) -> Uncertainty:
     """Intervals of the parameters at the fitted point u (P,).
 
@@ -93,13 +93,13 @@ def estimate(
     return uncertainty_of(evidence_of(objective, u, robust), objective.space, confidence)
 
 
-def evidence_of(objective: Told, u: np.ndarray, robust: bool = False) -> Evidence:
+def evidence_of(objective: DriveResiduals, u: np.ndarray, robust: bool = False) -> Information:
     """Information of the drives of an objective at the fitted point u (P,); `robust` as of `estimate`."""
     found = _evidence_at(objective, u, robust)
     return replace(found, ahead=_ahead(objective, found, robust))
 
 
-def _ahead(objective: Told, found: Evidence, robust: bool) -> np.ndarray:
+def _ahead(objective: DriveResiduals, found: Information, robust: bool) -> np.ndarray:
     """(2, P) how many times the half-width of each parameter's interval is that which it has from its lower and upper
     end, the others following there. 1 unless the parameter is one of `BENT`."""
     space, u = objective.space, found.u
@@ -116,7 +116,7 @@ def _ahead(objective: Told, found: Evidence, robust: bool) -> np.ndarray:
                 continue
             start = space.moved(u[None], step * inverse[None, :, index] / inverse[index, index])
             start[:, index] = u[index] + step
-            there = least_squares.fit(objective, space, starts=np.clip(start, 0.0, 1.0), iterations=FOLLOW,
+            there = least_squares.fit(objective, starts=np.clip(start, 0.0, 1.0), stop=least_squares.Stopping(FOLLOW),
                                       robust=robust, frozen=(space.names[index],)).u
             known = errors_of(_evidence_at(objective, there, robust, over))
             wide = known.quantile[index] * known.deviation[index] / reach[index]
@@ -132,7 +132,7 @@ def stretched(ahead: np.ndarray) -> np.ndarray:
     return np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
 
 
-def _evidence_at(objective: Told, u: np.ndarray, robust: bool, over: np.ndarray | None = None) -> Evidence:
+def _evidence_at(objective: DriveResiduals, u: np.ndarray, robust: bool, over: np.ndarray | None = None) -> Information:
     """Information of drives at any point u (P,), by slopes averaged over errors of a covariance `over` (P, P): those of
     slopes at u unless it is given."""
     space = objective.space
@@ -152,14 +152,14 @@ def _evidence_at(objective: Told, u: np.ndarray, robust: bool, over: np.ndarray 
     variance = max(float(np.square(residual).sum()) / max(objective.counted - space.size, 1), 1e-12)
     groups = _manoeuvres(objective)
     alike = shared_error(objective.own_frame(residual), groups)
-    found = Evidence(u, scores, blocks, groups, alike, variance, np.zeros((space.size, space.size)), 1.0)
+    found = Information(u, scores, blocks, groups, alike, variance, np.zeros((space.size, space.size)), 1.0)
     if objective.prior is not None:  # weighed as it was; its own variance is 1
         return replace(found, precision=objective.prior.precision, share=objective.prior.share)
     # Where nothing is known, the bounds are; they matter only along directions of which the log says nothing.
     return replace(found, precision=np.eye(space.size) / PRIOR_SD**2 * found.scale, share=found.scale)
 
 
-def uncertainty_of(evidence: Evidence, space: Space, confidence: float = CONFIDENCE) -> Uncertainty:
+def uncertainty_of(evidence: Information, space: Space, confidence: float = CONFIDENCE) -> Uncertainty:
     """Intervals from the information of a log."""
     u, errors = evidence.u, errors_of(evidence, confidence)
     information, directions = np.linalg.eigh(evidence.blocks.sum((0, 1)) / evidence.scale)
@@ -185,7 +185,7 @@ def uncertainty_of(evidence: Evidence, space: Space, confidence: float = CONFIDE
                        errors.quantile, evidence)
 
 
-def inflation(objective: Told, u: np.ndarray) -> float:
+def inflation(objective: DriveResiduals, u: np.ndarray) -> float:
     """How often the squared residuals count the same information: their sum over neighbours against that one by one."""
     residual, jacobian = (without_prior(objective, array[0]) for array in objective.jacobian(u[None]))
     hessian = np.einsum("bkp,bkq->pq", jacobian, jacobian)
@@ -194,7 +194,7 @@ def inflation(objective: Told, u: np.ndarray) -> float:
     return max(float(np.median(np.square(pieces).sum(0)[bent] / np.diag(hessian)[bent])), 1.0)
 
 
-def _manoeuvres(objective: Told) -> np.ndarray:
+def _manoeuvres(objective: DriveResiduals) -> np.ndarray:
     """(B,) which trials are replicates of one another, as a number for each."""
     numbers = np.arange(len(objective.trials))
     place = {id(trial): i for i, trial in enumerate(objective.trials)}
@@ -204,7 +204,7 @@ def _manoeuvres(objective: Told) -> np.ndarray:
 
 
 def _pieces(
-    objective: Told, jacobian: np.ndarray, residual: np.ndarray, bent: np.ndarray
+    objective: DriveResiduals, jacobian: np.ndarray, residual: np.ndarray, bent: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """J^T r (B, PIECES, P) and J^T J (B, PIECES, P, P) of pieces of trials, all channels of a piece together.
 

@@ -23,7 +23,7 @@ QUANTITIES = {
 }
 ROLES = ("time", *(f"{stream}.{one}" for stream in STREAMS for one in QUANTITIES[stream]))
 UNITS = {  # kind -> unit -> SI
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "in": 0.0254},
     "angle": {"rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "rev": 2 * np.pi},
     "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mm/s": 1e-3, "cm/s": 1e-2, "mph": 0.44704, "ft/s": 0.3048},
@@ -36,6 +36,7 @@ SPELLED = {
     "degree": "deg", "degrees": "deg", "radians": "rad", "radian": "rad", "mps": "m/s", "ms-1": "m/s", "kmh": "km/h",
     "kph": "km/h", "kmph": "km/h", "mmps": "mm/s", "cmps": "cm/s", "radps": "rad/s", "rads": "rad/s", "dps": "deg/s",
     "degps": "deg/s", "degs": "deg/s", "meter": "m", "meters": "m", "metre": "m", "metres": "m", "m s": "m/s",
+    "mins": "min", "minute": "min", "minutes": "min", "hour": "h", "hours": "h", "hrs": "h", "day": "d", "days": "d",
     "km h": "km/h", "mm s": "mm/s", "cm s": "cm/s", "rad s": "rad/s", "deg s": "deg/s", "°": "deg", "°/s": "deg/s",
 }
 STREAM_WORDS = {
@@ -56,10 +57,19 @@ QUANTITY_WORDS = {
           "geschwindigkeit", "geschw"),
     "x": ("x", "px", "posx", "tx", "easting"), "y": ("y", "py", "posy", "ty", "northing"),
 }
+TICKS = re.compile(r"tick|count|enc(oder)?s?([ _]|$)", re.IGNORECASE)
+"""In the names of wheel angles that an encoder counts."""
+PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")
+"""A unit of ticks: so many in a turn."""
+SIDES = {"left": {"left", "l", "lw", "wl", "vl", "lft", "links", "linkes"},
+         "right": {"right", "r", "rw", "wr", "vr", "rgt", "rechts", "rechtes"}}
 TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime", "date", "datetime",
               "uhrzeit", "datum")
 NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", "accel", "acceleration", "acc", "mag",
               "seq", "current", "voltage", "temperature", "battery", "torque", "effort", "error", "std", "var", "cov"}
+FASTEST_STEP = 5e-4  # s; rows that follow faster are in another unit of time
+SERIAL_DAYS, DAY_STEP = ((2e4, 6e4), (7.2e5, 7.6e5)), 5e-5
+"""Ranges of dates that count days, as spreadsheets and MATLAB have them, and the longest step of such a recording."""
 SAID = "as said"  # why a column has its role where somebody gave no unit
 TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
 TOO_SLOW = 0.02  # m/s; a pose that never moves faster shows no unit
@@ -98,6 +108,8 @@ class Table:
     columns: dict[str, np.ndarray]  # name -> (T,)
     odd: Mapping[str, str] = field(default_factory=dict)
     """Name of a column -> note on its cells that are no numbers."""
+    texts: Mapping[str, str] = field(default_factory=dict)
+    """Name of a column without numbers -> its first cell."""
 
 
 def kind_of(role: str) -> str:
@@ -107,6 +119,14 @@ def kind_of(role: str) -> str:
         return "none"
     return {"time": "time", "x": "length", "y": "length", "yaw": "angle", "v": "speed", "left": "rate", "right": "rate",
             "left_angle": "angle", "right_angle": "angle"}.get(quantity, "rate")
+
+
+def size_of(role: str, unit: str) -> float:
+    """Size of a unit of a role in SI units; KeyError for one that is not known."""
+    if kind_of(role) == "angle" and (turn := PER_TURN.fullmatch(unit)):
+        return 2 * np.pi / float(turn[1])
+    wheel = role.rpartition(".")[2] in ("left", "right")
+    return (UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(role)])[unit]
 
 
 def read_decision(text: str, tables: Sequence[Table]) -> Column:
@@ -124,11 +144,12 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
             for written in (f"{table.stem}/{name}", name):
                 unit = rest[len(written) :].strip()
                 if rest.startswith(written) and (not unit or unit.startswith(":")):
-                    kind = UNITS["speed"] | UNITS["rate"] if role in ("wheels.left", "wheels.right", "command.left",
-                                                                      "command.right") else UNITS[kind_of(role)]
                     unit = _unit(unit[1:].strip()) if unit else ""
-                    if unit and unit not in kind:
-                        raise ValueError(f"--columns {text}: {unit!r} is no unit of {role} (known: {', '.join(kind)}).")
+                    if unit and not _is_known(role, unit):
+                        known = ", ".join(UNITS["speed"] | UNITS["rate"] if role.endswith(("left", "right")) else
+                                          UNITS[kind_of(role)])
+                        ticks = ", N/rev for N ticks in a turn" if role.endswith("_angle") else ""
+                        raise ValueError(f"--columns {text}: {unit!r} is no unit of {role} (known: {known}{ticks}).")
                     return Column(role, table.stem, name, unit or _split_unit(name)[1], "" if unit else SAID)
     known = ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns)
     raise ValueError(f"--columns {text}: no such column (found {known[:400]}). Correct its name.")
@@ -197,7 +218,7 @@ def _by_name(table: Table, name: str) -> Column | None:
     plain, unit = _split_unit(name)
     words = _words(plain)
     joined = "".join(words)
-    turns = re.search(r"(angular|gyro|rate|orientation|quat\w*|rotation)z$", joined)
+    turns = re.search(r"((angular|gyro|rate|orientation|quat\w*|rotation)|^q\w{0,4})z$", joined)
     if _unit(name) in UNITS["time"] and _unit(name) not in ("s", "min"):  # a column that is named after its unit
         return Column("time", table.stem, name, _unit(name), "its name")
     if not words or NOT_PLANAR & set(words[-2:]) and not turns:
@@ -207,7 +228,8 @@ def _by_name(table: Table, name: str) -> Column | None:
             or words == ["rosbagtimestamp"]):
         if words[-1] in ("nsecs", "nsec", "nanosec") and "+" not in name and {"header", "stamp"} & set(words):
             return None  # the rest of a second; joined with secs when read
-        return Column("time", table.stem, name, unit, "its name")
+        last = _unit(words[-1])
+        return Column("time", table.stem, name, unit or (last if last in ("min", "h", "d") else ""), "its name")
     stream_words = {one for known in STREAM_WORDS.values() for one in known}
     quantity = _quantity([word for word in words if word not in stream_words] or words)
     if quantity is None:
@@ -215,15 +237,33 @@ def _by_name(table: Table, name: str) -> Column | None:
     stream, sure = _stream(words, _words(table.stem), quantity, table)
     if stream is None or quantity not in QUANTITIES[stream]:
         return None
+    if quantity in ("left", "right", "left_angle", "right_angle") and not unit and TICKS.search(name) \
+            and stream == "wheels" and _counts(table.columns[name]):
+        return Column(f"wheels.{quantity.removesuffix('_angle')}_angle", table.stem, name, "", "its name", False)
     return Column(f"{stream}.{quantity}", table.stem, name, unit, "its name", sure)
+
+
+def _counts(values: np.ndarray) -> bool:
+    """Whether values (T,) are whole numbers, as an encoder's."""
+    known = values[np.isfinite(values)]
+    return bool((known == np.round(known)).all())
+
+
+def _is_known(role: str, unit: str) -> bool:
+    try:
+        return size_of(role, unit) > 0
+    except (KeyError, ZeroDivisionError):
+        return False
 
 
 def _quantity(words: list[str]) -> str | None:
     text = " ".join(words)
-    sides = {"left": {"left", "l", "lw", "wl"}, "right": {"right", "r", "rw", "wr"}}
-    side = next((one for one, known in sides.items() if known & set(words)), "")
-    if side and re.search(r"^\w+$|wheel|motor|joint|\bw\b|vel|speed|rpm|enc|angle|pos|\blw\b|\brw\b|omega|cmd", text):
-        angle = re.search(r"angle|pos|position|enc(oder)?$|ticks", text) and not re.search(r"vel|speed|rpm", text)
+    if match := re.fullmatch(r"(p|pos|position|q|quat|quaternion|orientation) (?:\w{1,2} )*([wxyz])", text):
+        return f"q{match[2]}" if match[1][0] in "qo" else match[2] if match[2] in "xy" else None
+    side = next((one for one, known in SIDES.items() if known & set(words)), "")
+    if side and re.search(r"^\w+$|wheel|motor|joint|rad|\bw\b|vel|speed|rpm|enc|angle|pos|\blw\b|\brw\b|omega|cmd|tick|"
+                          "count", text):
+        angle = re.search(r"angle|pos|position|enc(oder)?$|tick|count", text) and not re.search(r"vel|speed|rpm", text)
         return f"{side}_angle" if angle else side
     last = words[-1]
     if match := re.search(r"\b(x|y|z|theta|yaw|heading|psi) (vel|velocity|speed|rate|dot)$", text):
@@ -283,7 +323,7 @@ def _words(name: str) -> list[str]:
 
 def _split_unit(name: str) -> tuple[str, str]:
     """Name without its unit, and the unit; empty where none is written."""
-    if match := re.search(r"[\[(<]\s*([^\])>]+)\s*[\])>]\s*$", name):
+    if match := re.search(r"[\[(<]\s*([^\])>]*)\s*[\])>]\s*$", name):
         return name[: match.start()], _unit(match[1])
     rest, gap, last = re.match(r"(.*?)([_ .]?)([^_ .]*)$", name, re.DOTALL).groups()  # type: ignore[union-attr]
     if gap and last.lower() in STREAM_LAST and (split := _split_unit(rest))[1]:  # left_rpm_cmd
@@ -322,9 +362,11 @@ def _time_unit(column: Column, values: np.ndarray) -> Column:
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):  # since 1970
         if first > least:
             return replace(column, unit=unit, why="it counts since 1970")
+    if step < DAY_STEP and any(low < first < high for low, high in SERIAL_DAYS):
+        return replace(column, unit="d", why="it counts days")
     for unit, longest in (("s", 4.0), ("ms", 4e3), ("us", 4e6)):
         if step < longest:
-            return replace(column, unit=unit, why=f"it steps by {step:.3g}")
+            return replace(column, unit=unit, why=f"it steps by {step:.3g}", sure=column.sure and step > FASTEST_STEP)
     return replace(column, unit="ns", why=f"it steps by {step:.3g}")
 
 
@@ -342,6 +384,8 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
     for role, rates, why in (("v", ways, "as the vehicle moves"), ("omega", turns, "as the vehicle turns")):
         measured = _first(drive.signal(f"odometry.{role}"), rates["odometry"], rates["ground_truth"])
         drive.settle(f"command.{role}", measured, why, 0.5)
+    drive.settle_wheels(_first(drive.signal("command.v"), drive.signal("odometry.v"), *ways.values(),
+                               drive.raw("command.v")))
     return [one if one.role == "time" else _with_some_unit(drive.columns[one.role], arrays[one.file, one.name])
             for one in found]
 
@@ -349,7 +393,7 @@ def _units_by_numbers(found: list[Column], arrays: Mapping[tuple[str, str], np.n
 def _with_some_unit(one: Column, values: np.ndarray) -> Column:
     """The column, in SI where nothing shows its unit, if that is at all possible."""
     wheel = one.role.rpartition(".")[2] in ("left", "right")
-    if one.unit in (UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(one.role)]):
+    if _is_known(one.role, one.unit):
         return one
     usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
     largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
@@ -389,6 +433,19 @@ class _Known:
         unit = _size_of(mine, reference, UNITS[kind_of(role)], loose)
         if unit is not None:
             self.columns[role] = replace(one, unit=unit, why=f"{one.why}; {why}")
+
+    def settle_wheels(self, reference: tuple[np.ndarray, np.ndarray] | None) -> None:
+        """Find whether wheel speeds are those of their rims: no wheel has a radius of a metre, or of a millimetre."""
+        for stream in ("wheels", "command"):
+            sides = [self.raw(f"{stream}.{side}") for side in ("left", "right")]
+            if sides[0] is None or sides[1] is None or len(sides[0][0]) != len(sides[1][0]):
+                continue
+            mean = sides[0][0], (sides[0][1] + sides[1][1]) / 2
+            unit = _size_of(mean, reference, {one: UNITS["speed"][one] for one in ("m/s", "mm/s")}, ALIKE)
+            for side in ("left", "right") if unit is not None else ():
+                one = self.columns[f"{stream}.{side}"]
+                if not _is_known(one.role, one.unit):
+                    self.columns[one.role] = replace(one, unit=str(unit), why=f"{one.why}; as the vehicle moves")
 
     def settle_pose(self, stream: str) -> None:
         """Find the units of a pose: of its heading by the range, of its place by how fast it moves."""
@@ -440,6 +497,8 @@ def _size_of(
     for one, size in units.items():
         if all(abs(np.log(size / other)) > np.log(1 + ALIKE) for other in apart.values()):
             apart[one] = size
+    if ratio <= 0:
+        return None
     unit = min(apart, key=lambda one: abs(np.log(ratio / apart[one])))
     return unit if abs(np.log(ratio / apart[unit])) < np.log(1 + loose) + 0.05 else None
 

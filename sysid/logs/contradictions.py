@@ -7,27 +7,21 @@ the axle. A regression of both on v and omega shows the angle between the pose's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.pose_jumps import constant_columns, jumps
+from sysid.logs.clocks import NONE, RESPONSE, VARIED, WHOLE, another_clock, running_fast
+from sysid.logs.pose_jumps import constant_columns, frozen, jumps
 from sysid.logs.records import Trial, command_in_force
 from sysid.logs.streams import GRID_DT, SMOOTHING
 
-RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
 MOVING = 0.05  # m/s or rad/s of a pose that moves
-NONE = 0.02  # m/s, below which a speed is none
-VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
 APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
-WHOLE = 0.8  # share of the motion that a direction must explain
 LITTLE = 0.75  # the same, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
 SURE = 4.0  # standard errors that such an angle must have
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
-REACH, LAG_DT = 10.0, 0.1  # s of a clock that is looked for, and its steps
-LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
-UNLIKE = 0.3  # of what is not alike without a shift, that may be left with it
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
 PLAINER = 0.1  # share of the motion that another explanation must explain more of
@@ -39,6 +33,7 @@ class Motion:
 
     t: np.ndarray  # (G,) s
     steps: np.ndarray  # (G, 2) m/s, in the fixed frame
+    place: np.ndarray  # (G, 2) m
     yaw: np.ndarray  # (G,)
     turn: np.ndarray  # (G,) rad/s
     v: np.ndarray  # (G,) m/s that it should have
@@ -66,25 +61,37 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
     Args:
         reach: how far from the axle's centre a tracked point may be [m]. That of the odometry is the centre.
     """
-    return {name: _of_stream(name, trials, reach if name == "ground_truth" else 0.0)
-            for name in ("odometry", "ground_truth")}
+    found: dict[str, list[str]] = {}
+    for name in ("odometry", "ground_truth"):
+        alone = name == "odometry" or bool(found["odometry"]) or any(trial.odometry is None for trial in trials)
+        found[name] = _of_stream(name, trials, reach if name == "ground_truth" else 0.0,
+                                 "commands" if alone else "odometry")
+    if not any(found.values()) and (far := _far_point(trials, reach)):
+        found["ground_truth"] = [far]
+    return found
 
 
-def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
+def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) -> list[str]:
     empty = _empty_speeds(trials) if name == "odometry" else []
-    if found := [*jumps(name, trials), *empty, *constant_columns(name, trials)]:
+    if found := constant_columns(name, trials) or frozen(name, trials) or [*jumps(name, trials), *empty]:
         return found
-    if said := another_clock(name, trials):
+    if said := running_fast(name, trials, beside) or another_clock(name, trials):
         return [said]
     motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if not motions:
         return []
     plain = _pooled([direction(one, reach) for one in motions])
+    against = float(np.median([_likeness(one.turn, one.omega) for one in motions]))
+    if against < -WHOLE and _pooled([direction(_inverted(one), reach) for one in motions]).explained > max(
+            WHOLE, plain.explained):
+        return [f"{name}: its pose is that of the fixed frame as the vehicle sees it: parent and child are exchanged. "
+                "Invert the transform: (x, y) = -R(-yaw) (x, y), then yaw = -yaw."]
     if plain.explained < LITTLE:
         mirrored = _pooled([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
-            return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged). "
-                    "Counter-clockwise is positive yaw; negate y, or exchange the axes."]
+            return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged), "
+                    "or yaw is a compass heading. Counter-clockwise is positive yaw; negate y, exchange the axes, or "
+                    "take 90 deg - heading."]
         if name == "odometry" and _in_fixed_frame(motions):
             return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
                     "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
@@ -92,6 +99,9 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
             return [f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of how "
                     "the pose moves. Check that both are of one vehicle, frame and clock."]
         return []
+    if name == "odometry" and against < -WHOLE and _obeys(trials):
+        return ["odometry: its yaw turns against its own omega, which follows the commands: yaw has the wrong sign. "
+                "Counter-clockwise is positive; negate yaw, and y if that turns with it."]
     if plain.explained > WHOLE and ANGLE < abs(plain.angle) < BACKWARDS and abs(plain.angle) > SURE * plain.error:
         degrees = np.rad2deg(plain.angle)
         side = "left" if degrees > 0 else "right"
@@ -102,20 +112,6 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float) -> list[str]:
                 f"the vehicle's. Correct them: {remedy}."]
     return []
 
-
-def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds beside it") -> str:
-    """A sentence on a stream of which most trials come later or earlier than the speeds beside it; else empty.
-
-    Args:
-        beside: "commands" compares with these, though there is an odometry.
-    """
-    lates = [late for trial in trials if (late := lateness(trial, name, beside == "commands")) is not None]
-    if len(lates) <= len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
-        return ""
-    late = float(np.median(lates))
-    return (f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the {beside}: "
-            f"another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s {'from' if late > 0 else 'to'} its "
-            "t.")
 
 
 def motion_of(trial: Trial, name: str) -> Motion | None:
@@ -141,7 +137,8 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
                     for one in (odometry.v, odometry.omega))
     if v.std() < VARIED:
         return None
-    return Motion(t, steps, at(t, source.yaw), turn[:, 0], v, omega)
+    place = np.stack([at(t, source.x), at(t, source.y)], axis=-1)
+    return Motion(t, steps, place, at(t, source.yaw), turn[:, 0], v, omega)
 
 
 def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
@@ -172,6 +169,47 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
                      float("inf") if too_far else ahead)
 
 
+def _inverted(motion: Motion) -> Motion:
+    """The same motion if the pose is that of the fixed frame in the vehicle's."""
+    cos, sin, half = np.cos(motion.yaw), np.sin(motion.yaw), GRID_DT / 2
+    x, y = motion.place.T
+    back = -np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
+    return replace(motion, steps=np.gradient(back, 2 * half, axis=0), place=back, yaw=-motion.yaw, turn=-motion.turn)
+
+
+def _obeys(trials: Sequence[Trial]) -> bool:
+    """Whether the odometry's yaw rate has the sign of the commanded one."""
+    found = [_likeness(one.odometry.omega, one.command.omega[np.maximum(
+        command_in_force(one.command, one.odometry.t - RESPONSE), 0)]) for one in trials if one.odometry is not None]
+    return bool(np.median(found) > 0)
+
+
+def _likeness(one: np.ndarray, other: np.ndarray) -> float:
+    """Correlation of two signals (T,), 0 where one hardly changes."""
+    return float(np.corrcoef(one, other)[0, 1]) if min(one.std(), other.std()) > MOVING else 0.0
+
+
+def _far_point(trials: Sequence[Trial], reach: float) -> str:
+    """A sentence on a tracked point that surely is farther from the axle's centre than a vehicle reaches, or none."""
+    motions = [motion for trial in trials if (motion := motion_of(trial, "ground_truth")) is not None]
+    if not motions:
+        return ""
+    design = np.concatenate([np.column_stack([one.v, one.omega]) for one in motions])
+    along = np.concatenate([np.exp(-1j * one.yaw) * (one.steps[:, 0] + 1j * one.steps[:, 1]) for one in motions])
+    gains = np.linalg.lstsq(design, along, rcond=None)[0]
+    left = along - design @ gains
+    spread = np.linalg.pinv(design.T @ design) * np.square(np.abs(left)).mean() * APART / GRID_DT
+    explained = 1 - float(np.square(np.abs(left)).sum() / max(np.square(np.abs(along)).sum(), 1e-12))
+    if explained < WHOLE or abs(gains[1]) - SURE * np.sqrt(spread[1, 1]) < reach or abs(gains[0]) < 1e-9:
+        return ""
+    place = -1j * gains[1] * abs(gains[0]) / gains[0]  # a turn moves a point ahead to the left
+    ways = (f"{abs(place.real):.2f} m {'ahead of' if place.real > 0 else 'behind'}",
+            f"{abs(place.imag):.2f} m to the {'left' if place.imag > 0 else 'right'} of")
+    return (f"ground_truth: its point is {ways[0]} and {ways[1]} the drive-axle centre, farther than the vehicle "
+            f"reaches ({reach:.2f} m). If that is so, state it: sysid.convert takes --truth-ahead {place.real:.2f} "
+            f"--truth-left {place.imag:.2f}; else take the body that is on the vehicle.")
+
+
 def _in_fixed_frame(motions: Sequence[Motion]) -> bool:
     """Whether v follows the motion along one fixed direction, and not that along the vehicle."""
     fixed, own = [], []
@@ -189,50 +227,6 @@ def _explained(signal: np.ndarray, design: np.ndarray) -> float:
     return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
 
 
-def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
-    """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
-    explains what nothing else does; None otherwise.
-
-    Rates of turning and of motion are compared: no frame changes them.
-
-    Args:
-        beside: compare with the commands, though there are measured speeds.
-    """
-    source, odometry = getattr(trial, name), trial.odometry
-    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
-        return None
-    begin, end = min(source.t[0], trial.command.t[0]), max(source.t[-1], trial.command.t[-1])
-    t = np.arange(begin, end, LAG_DT)
-    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
-    inside = (t > source.t[0] + half) & (t < source.t[-1] - half)
-    x, y, yaw = ((np.interp(t + half, source.t, one) - np.interp(t - half, source.t, one)) / (2 * half) * inside
-                 for one in (source.x, source.y, source.yaw))
-    held = command_in_force(trial.command, t - RESPONSE)
-    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
-    commanded = beside or odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
-    if odometry is not None and not commanded:
-        v, omega = (np.interp(t, odometry.t, one, 0.0, 0.0) for one in (odometry.v, odometry.omega))
-    pairs = [(ours, theirs) for ours, theirs in ((yaw, omega), (np.hypot(x, y), np.abs(v)))
-             if min(ours.std(), theirs.std()) > VARIED]
-    if not pairs:
-        return None
-    most = min(round(REACH / LAG_DT), len(t) - 1)
-    # A skid drive turns late and little, a circle has one speed: the pair that fits best shows the clock.
-    alike = max((np.array([_overlap(ours, theirs, lag) for lag in range(-most, most + 1)]) for ours, theirs in pairs),
-                key=np.max)
-    now, k = float(alike[most]), int(np.argmax(alike))
-    bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
-    late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
-    near = round(LATE[commanded] / LAG_DT)
-    against = -float(alike[most - near : most + near + 1].min())  # where the sign is reversed
-    clear = alike[k] > WHOLE and 1 - alike[k] < UNLIKE * (1 - max(now, against))
-    return late if clear and abs(late) > LATE[commanded] else None
-
-
-def _overlap(ours: np.ndarray, theirs: np.ndarray, lag: int) -> float:
-    """Likeness of rates (T,) with others (T,) that come so many rows earlier; outside of them nothing moves."""
-    one, other = ours[max(lag, 0) : len(ours) + min(lag, 0)], theirs[max(-lag, 0) : len(theirs) - max(lag, 0)]
-    return float(one @ other) / max(float(np.sqrt((ours @ ours) * (theirs @ theirs))), 1e-9)
 
 
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:

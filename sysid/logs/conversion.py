@@ -22,7 +22,7 @@ from sysid.logs.records import Log, PoseStream, Start, Trial
 from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.sources import is_lerobot
 from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
-from whill_mjx.io.command_line import WRITING, Range
+from whill_mjx.io.command_line import WRITING, Range, With
 from whill_mjx.io.fields import COLUMNS, counted
 from whill_mjx.io.folders import unfinished
 from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
@@ -45,7 +45,7 @@ class ConvertConfig:
     """Dataset folder; made where it does not exist, else the trials are added."""
     to: Literal["dataset", "lerobot"] = "dataset"
     """What is written: a driving-log dataset, or a LeRobotDataset v3 of a driving-log dataset."""
-    fps: Annotated[int | None, Range(1, 1000)] = None
+    fps: Annotated[int | None, Range(1, 1000), With("to", ("lerobot",))] = None
     """Frames per second of a LeRobotDataset that is written; by default the rate of the measurements."""
     vehicle: str = "whill_cr"
     """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
@@ -65,6 +65,8 @@ class ConvertConfig:
     """Imu with the yaw rate of the body about its z axis; '' goes without."""
     truth_ahead: Annotated[float, Range(-10, 10)] = 0.0
     """How far the tracked point lies ahead of the drive-axle centre [m]."""
+    truth_left: Annotated[float, Range(-10, 10)] = 0.0
+    """How far it lies to the left of it [m]."""
     truth_turned: Annotated[float, Range(-360, 360)] = 0.0
     """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
     input: Literal["auto", "commands", "wheels"] = "auto"
@@ -74,7 +76,7 @@ class ConvertConfig:
     """Time of receipt (one clock for all), or the header's (when measured)."""
     split: Literal["bag", "standstill"] = "bag"
     """One trial per bag, or one per drive between standstills."""
-    pause: Annotated[float, Range(0, 3600)] = 2.0
+    pause: Annotated[float, Range(0, 3600), With("split", ("standstill",))] = 2.0
     """Least standstill between two drives [s]."""
     held_out: tuple[str, ...] = ()
     """Trials that are never to be fitted."""
@@ -83,8 +85,13 @@ class ConvertConfig:
     columns: tuple[str, ...] = ()
     """What columns of CSV files hold, each as ROLE=[FILE/]COLUMN[:UNIT], e.g. command.v=speed_set:km/h; the rest is
     guessed."""
-    command_timeout: float | None = None
+    command_timeout: Annotated[float | None, Range(0.01, 60)] = None
     """How long the base drives on where no command comes [s]; by default a command holds until the next."""
+
+
+OF_RECORDINGS = ("vehicle", "wheel_radius", "track", "mass", "command_topic", "odometry_topic", "truth_topic",
+                 "imu_topic", "input", "stamp", "split")
+"""Options that are for bags and tables."""
 
 
 @dataclass(frozen=True)
@@ -150,9 +157,14 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
 
         if config.columns:
             raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
+        if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
+            raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
+                             "Leave it out.")
         log = load_whole(config.source, config.select)
         spec, notes = log.spec, list(log.notes)
-        drives = [_moved(trial_drive(trial), config.truth_ahead, config.truth_turned) for trial in log.trials]
+        drives = [trial_drive(trial) for trial in log.trials]
+        drives = [one if one.ground_truth is None else replace(one, ground_truth=_at_axle(one.ground_truth, config))
+                  for one in drives]
         if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
             notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
     if not drives:
@@ -287,7 +299,7 @@ def cut_drives(
 ) -> tuple[list[Drive], list[str]]:
     """The trials of one recording, whole or cut at standstill, and notes."""
     if "ground_truth" in tables:
-        tables["ground_truth"][:, 3] -= np.deg2rad(config.truth_turned)
+        tables["ground_truth"] = _at_axle(tables["ground_truth"], config)
     notes = []
     if config.split == "bag":
         ends = [(table[0, 0], table[-1, 0]) for name, table in tables.items() if name not in ("command", "imu")]
@@ -298,7 +310,7 @@ def cut_drives(
     drives = []
     for number, span in enumerate(spans, start=1):
         name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
-        drives.append(cut(name, tables, span, config.truth_ahead, source))
+        drives.append(cut(name, tables, span, source))
     return drives, notes
 
 
@@ -312,7 +324,7 @@ def _recording_name(path: Path) -> str:
 
 
 def cut(
-    name: str, tables: dict[str, np.ndarray], span: tuple[float, float], truth_ahead: float, source: Source
+    name: str, tables: dict[str, np.ndarray], span: tuple[float, float], source: Source
 ) -> Drive:
     """The part of a recording between two times [s] as a trial that counts from its start.
 
@@ -338,11 +350,6 @@ def cut(
         found["odometry"][:, 3] = np.unwrap(found["odometry"][:, 3])
         pose = PoseStream(*found["odometry"][:, :4].T)
         found["odometry"][:, 1:4] = relative_pose(pose, Start(*found["odometry"][0, 1:4]))
-    if "ground_truth" in found:
-        truth = found["ground_truth"]
-        truth[:, 1] -= truth_ahead * np.cos(truth[:, 3])
-        truth[:, 2] -= truth_ahead * np.sin(truth[:, 3])
-        truth[:, 3] = np.angle(np.exp(1j * truth[:, 3]))
     return Drive(name, found["command"], found.get("odometry"), found.get("ground_truth"), found.get("imu"))
 
 
@@ -405,16 +412,14 @@ def trial_drive(trial: Trial) -> Drive:
     return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose, imu)
 
 
-def _moved(drive: Drive, ahead: float, turned: float) -> Drive:
-    """The drive with its outside pose at the drive-axle centre and along the vehicle, as of `cut`."""
-    if drive.ground_truth is None or ahead == turned == 0.0:
-        return drive
-    truth = drive.ground_truth.copy()
-    truth[:, 3] -= np.deg2rad(turned)
-    truth[:, 1] -= ahead * np.cos(truth[:, 3])
-    truth[:, 2] -= ahead * np.sin(truth[:, 3])
-    truth[:, 3] = np.angle(np.exp(1j * truth[:, 3]))
-    return replace(drive, ground_truth=truth)
+def _at_axle(truth: np.ndarray, config: ConvertConfig) -> np.ndarray:
+    """Rows (T, 4) of an outside pose at the drive-axle centre and along the vehicle."""
+    t, x, y, yaw = truth.T
+    yaw = yaw - np.deg2rad(config.truth_turned)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x = x - config.truth_ahead * cos + config.truth_left * sin
+    y = y - config.truth_ahead * sin - config.truth_left * cos
+    return np.column_stack([t, x, y, np.angle(np.exp(1j * yaw))])
 
 
 def write_dataset(

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.contradictions import another_clock, contradictions
+from sysid.logs.clocks import another_clock
+from sysid.logs.contradictions import contradictions
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import Command, Log, Trial, command_in_force
@@ -151,7 +152,7 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
         found += contradicted[channel]
-        seen: list[str] = []
+        seen, reversed_ones, clear = list[str](), list[str](), True
         shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
             gains = _gains(trials, channel, index, list(shifts.values()))
@@ -163,24 +164,32 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
                 gain, follows = gains[-1]
             where = f"{channel}: {name} is {gain:.2f} times the command (median of {len(trials)} trials)"
             odd = not least < gain < 2.0
+            clear &= not odd or abs(follows) >= FOLLOWS and (gain > 0 or least < -gain < 2.0)
             if odd and abs(follows) < FOLLOWS:
                 seen.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
             elif gain < 0 and channel == "ground_truth" and name == "v":
-                seen.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add pi to "
-                            "yaw, or negate the commands' v, whichever is wrong.")
+                reversed_ones.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add "
+                                     "pi to yaw, or negate the commands' v, whichever is wrong.")
             elif gain < 0:
-                seen.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise positive omega "
-                             f"and yaw; negate it.")
+                reversed_ones.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise "
+                                     "positive omega and yaw; negate it.")
             elif odd and (limit := _limit(trials, channel, index)) is not None:
                 found.append(f"{where}, but follows commands below {limit:.2g} {unit}: it is limited to about that. "
                              "Larger commands act as that one; cut them in command.csv before a fit.")
             elif odd:
                 seen.append(f"{where}: check its unit ({unit}), or the wheel radius and track that the commands "
                              "were computed with.")
+        if clear:
+            seen += reversed_ones
+        elif reversed_ones and not seen:
+            seen.append(f"{channel}: its motion goes with the commands neither as it is nor with a sign reversed: "
+                        "check its clock and its frame.")
         other = (another_clock(channel, trials, "commands") or _exchanged(channel, trials)) if seen else ""
         found += [other] if other else seen  # such a log shows neither sign nor unit
-        lengths = [(_length(trial, channel), _length_told(trial)) for trial in trials]
+        if contradicted[channel]:
+            continue
+        lengths = [(_length(trial, channel), _length_told(trial, channel)) for trial in trials]
         ratios = [ours / commanded for ours, commanded in lengths if commanded > 1.0 and np.isfinite(ours)]
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
@@ -265,9 +274,8 @@ def _length(trial: Trial, channel: str) -> float:
     return float(np.hypot(np.diff(stream.x[places]), np.diff(stream.y[places])).sum())
 
 
-def _length_told(trial: Trial) -> float:
-    ideal = ideal_replay(trial)
-    stream = ideal.ground_truth or ideal.odometry
+def _length_told(trial: Trial, channel: str) -> float:
+    stream = getattr(ideal_replay(trial), channel)
     if stream is None or stream.x is None or stream.y is None:
         return 0.0
     return float(np.hypot(np.diff(stream.x), np.diff(stream.y)).sum())

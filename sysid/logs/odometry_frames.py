@@ -52,8 +52,8 @@ def at_frames(trials: Sequence[Trial], period: float | None) -> tuple[Trial, ...
 
 def note(period: float) -> str:
     """For the report."""
-    return (f"the odometry is computed every {1e3 * period:.4g} ms, so that some of its rows are older than others: "
-            "all are taken at the times of their frames")
+    return (f"the odometry is computed every {1e3 * period:.4g} ms, so some of its rows are older than others: each "
+            "row is moved to the time at which it was computed")
 
 
 def find_period(trials: Sequence[Trial]) -> float | None:

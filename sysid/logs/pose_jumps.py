@@ -1,4 +1,4 @@
-"""Poses that no vehicle drives: jumps from one row to the next, and columns that never change."""
+"""Poses that no vehicle drives: jumps from one row to the next, rows that stand still, columns that never change."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from sysid.logs.records import Trial
 JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step that is a jump
 RARE = (3, 0.05)  # jumps of one drive, and of the rows of an outside pose; more are noise
 HELD = 0.5  # s for which rows repeat before a jump when a driver was held up
+FROZEN = 1.0  # s for which rows repeat that is longer than a driver takes between two updates
 MOVED = 0.5  # m and rad that a vehicle goes and turns by when each of its columns must change
 
 
@@ -61,6 +62,35 @@ def _held_before(stream: Any, row: int) -> float:
     rows = np.stack([stream.x, stream.y], axis=-1)[: row + 1]
     other = np.flatnonzero((rows != rows[-1]).any(axis=1))
     return float(stream.t[row] - stream.t[other[-1] + 1 if len(other) else 0])
+
+
+def frozen(name: str, trials: Sequence[Trial]) -> list[str]:
+    """A sentence on a pose that stands still while another stream shows that the vehicle drives on."""
+    found = [(trial, *span) for trial in trials if (span := _frozen_of(name, trial)) is not None]
+    if not found:
+        return []
+    trial, begin, end, other, way = found[0]
+    return [f"{name}: in {len(found)} of {len(trials)} trials ({trial.name}, from {begin:.1f} to {end:.1f} s) its rows "
+            f"repeat while the {other} moves on by {way:.1f} m: nothing was measured there. Leave these rows "
+            "out."]
+
+
+def _frozen_of(name: str, trial: Trial) -> tuple[float, float, str, float] | None:
+    """Begin and end [s] of the longest time in which a pose repeats, what moves on meanwhile, and how far."""
+    stream = getattr(trial, name)
+    other = "odometry" if name == "ground_truth" else "ground_truth"
+    beside = getattr(trial, other)
+    if stream is None or beside is None or stream.x is None or stream.y is None or beside.x is None:
+        return None
+    same = (np.diff(stream.x) == 0) & (np.diff(stream.y) == 0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    runs = [(float(stream.t[a]), float(stream.t[b])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    begin, end = max(runs, key=lambda one: one[1] - one[0], default=(0.0, 0.0))
+    inside = (beside.t >= begin) & (beside.t <= end)
+    if end - begin < FROZEN or inside.sum() < 2:
+        return None
+    way = float(np.hypot(*(np.ptp(one[inside]) for one in (beside.x, beside.y))))
+    return (begin, end, other, way) if way > MOVED else None
 
 
 def constant_columns(name: str, trials: Sequence[Trial]) -> list[str]:

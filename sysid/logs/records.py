@@ -124,7 +124,7 @@ class Trial:
     manoeuvre: str
     """Trials of one manoeuvre with equal commands are replicates."""
     command: Command
-    """What the vehicle was told."""
+    """Commanded speed and yaw rate."""
     odometry: OdometryStream | None
     """What it reported; None where that was not logged."""
     ground_truth: PoseStream | None

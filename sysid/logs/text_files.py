@@ -15,13 +15,15 @@ import numpy as np
 
 from sysid.logs.columns import (
     QUANTITIES,
+    TICKS,
+    TIME_WORDS,
     UNITS,
     Column,
     Table,
     guess,
-    kind_of,
     read_decision,
     shown_units,
+    size_of,
     unit_named,
     with_unit,
 )  # fmt: skip
@@ -35,6 +37,10 @@ DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 LONGEST_NAME = 200  # characters
 HOUR = 3600.0  # s
 DAY = 86400.0  # s
+ONE_SIDE = 0.5  # of the squares of qx and qy of a vehicle that lies on its side
+DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})[ T/,-]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)?"
+                  r" *([AaPp][Mm])?")
+"""A date and a time of day, as spreadsheets, MATLAB and `rostopic echo -p` write them."""
 PREAMBLE = 30  # lines above the names
 BACK = (3.0, 0.1)  # usual steps, and s, by which a row may be older than the one before it: it came out of order
 NAMED = 12  # columns that an error lists
@@ -147,8 +153,6 @@ def read_table(path: Path) -> Table:
     elif comments and len(_cells(comments[-1], split)) == len(_cells(data[0][1], split)):
         header = _cells(comments[-1], split)
     rows = [_cells(line, split) for _, line in data]
-    if rows and not any("." in cell for cell in rows[0]):
-        rows = [[cell.replace(",", ".") for cell in row] for row in rows]  # decimal commas
     width = len(header) if header is not None else len(rows[0]) if rows else 0
     if rows and all(len(row) > width and not any(row[width:]) for row in rows):
         rows = [row[:width] for row in rows]  # each row ends with a separator, and the names do not
@@ -162,7 +166,7 @@ def read_table(path: Path) -> Table:
     if header is not None and all(unit_named(cell) for cell in rows[0] if cell) and any(rows[0]):
         header, data, rows = list(map(with_unit, header, rows[0])), data[1:], rows[1:]
     if header is None:
-        header = list(TUM) if width == len(TUM) else [f"column{k + 1}" for k in range(width)]
+        header = _tum_names(rows) if width == len(TUM) else [f"column{k + 1}" for k in range(width)]
     odd = next((name for name in header if not name.isprintable() or len(name) > LONGEST_NAME), None)
     if odd is not None:
         raise ValueError(f"{path}: column {shown(odd)}: a name has at most {LONGEST_NAME} printable characters. "
@@ -174,10 +178,12 @@ def _table(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]], lin
     """The columns of a file that hold numbers, and notes on their cells that do not."""
     numbers: dict[str, np.ndarray] = {}
     odd: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for name, *cells in zip((one.strip() for one in header), *rows, strict=True):
-        values = _numbers(cells)
+        values = _numbers(cells := _without_separators(cells))
         known = np.isfinite(values)
         if known.sum() < 3 or not name:
+            texts |= {name: cells[0]} if name and any(cells) else {}
             continue
         if name in numbers and not np.array_equal(numbers[name], values, equal_nan=True):
             raise ValueError(f"{path}: two columns are named {shown(name)} and differ. Give each its own name.")
@@ -186,7 +192,24 @@ def _table(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]], lin
         if wrong:
             odd[name] = (f"{counted(len(wrong), 'cell')} of {name} {'is no number' if len(wrong) == 1 else 'are none'} "
                          f"({shown(cells[wrong[0]])} in line {lines[wrong[0]]}): left out")
-    return Table(path.stem, _with_whole_stamps(numbers), odd)
+    return Table(path.stem, _with_whole_stamps(numbers), odd, texts)
+
+
+def _tum_names(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Names of the columns of a trajectory in TUM's form. Some programs write w of the quaternion first, which shows
+    where a vehicle would lie on its side otherwise."""
+    parts = np.array([[_number(cell) for cell in row[4:]] for row in rows])
+    last, first = (float(np.nanmean((parts[:, k : k + 2] ** 2).sum(1))) for k in (0, 1))
+    return [*TUM[:4], "qw", "qx", "qy", "qz"] if first < ONE_SIDE / 10 < ONE_SIDE < last else list(TUM)
+
+
+def _without_separators(cells: Sequence[str]) -> list[str]:
+    """The cells of a column with decimal points, and without the separators of thousands that some of them show."""
+    if any(re.fullmatch(r"[-+]?\d{1,3}(\.\d{3})+,\d+|[-+]?\d{1,3}(\.\d{3}){2,}", cell) for cell in cells):
+        cells = [cell.replace(".", "") for cell in cells]
+    if any(re.fullmatch(r"[-+]?\d{1,3}(,\d{3})+\.\d+|[-+]?\d{1,3}(,\d{3}){2,}", cell) for cell in cells):
+        return [cell.replace(",", "") for cell in cells]
+    return [cell.replace(",", ".") if re.fullmatch(r"[-+]?\d*,\d*([eE][-+]?\d+)?", cell) else cell for cell in cells]
 
 
 def _texts(folder: Path) -> list[Path]:
@@ -234,21 +257,37 @@ def _numbers(cells: Sequence[str]) -> np.ndarray:
     values = np.array([_number(cell) for cell in cells])
     if np.isfinite(values).any() or not any(":" in cell for cell in cells):
         return values
-    values = np.array([_seconds(cell) for cell in cells])
+    day_first = any((date := DATE.match(cell)) and date[2] == "." or date and int(date[1]) > 12 for cell in cells)
+    values = np.array([_seconds(cell, bool(day_first)) for cell in cells])
     again = DAY if any(cell.count(":") > 1 for cell in cells) else HOUR  # past midnight, or of minutes past the hour
     return values + again * np.cumsum(np.diff(values, prepend=values[:1]) < -again / 2)
 
 
-def _seconds(cell: str) -> float:
-    """Seconds since 1970 of a date with a time of day, since midnight, or of minutes; nan of anything else."""
+def _seconds(cell: str, day_first: bool) -> float:
+    """Seconds since 1970 of a date with a time of day, since midnight, or of minutes; nan of anything else.
+
+    Args:
+        day_first: a date that does not begin with its year begins with the day, not with the month.
+    """
     if match := re.fullmatch(r"(?:(\d{1,2}):(?=\d+:))?(\d{1,2}):(\d{2}(?:[.,]\d+)?)", cell):
         if match[1] or not match[3].isdigit():  # 12:30 may be hours
             return HOUR * float(match[1] or 0) + 60 * float(match[2]) + float(match[3].replace(",", "."))
     try:
-        found = datetime.fromisoformat(cell.replace(",", "."))
+        found = datetime.fromisoformat(cell.replace(",", ".")) if not (date := DATE.fullmatch(cell)) else _date(
+            date, day_first)
     except ValueError:
         return float("nan")
     return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+
+
+def _date(match: re.Match[str], day_first: bool) -> datetime:
+    first, second, third = int(match[1]), int(match[3]), int(match[4])
+    year, month, day = (first, second, third) if len(match[1]) == 4 else (third, second, first) if day_first else (
+        third, first, second)
+    hour, half = int(match[5]), (match[9] or "").lower()
+    if half:
+        hour = hour % 12 + 12 * half.startswith("p")
+    return datetime(year, month, day, hour, int(match[6]), int(match[7] or 0), int((match[8] or "0")[:6].ljust(6, "0")))
 
 
 def _number(cell: str) -> float:
@@ -306,7 +345,7 @@ def _decide(
         columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guessed_now()]
         problem, said = _problem(tables, columns), [str(one) for one in columns]
     if problem:
-        names = [f"{table.stem}/{name}" for table in tables for name in table.columns]
+        names = [f"{table.stem}/{name}" for table in tables for name in (*table.columns, *table.texts)]
         listed = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
         guessed = " ".join(f"'{one}'" for one in columns) or "nothing"
         raise ValueError(f"{source}: {problem} Its columns are {listed}; guessed: {guessed}. Give --columns with what "
@@ -328,7 +367,11 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
     used = {one.file for one in columns if one.role != "time"}
     timeless = sorted(used - {one.file for one in columns if one.role == "time"})
     if timeless:
-        return f"no column of {timeless[0]} is surely its time."
+        texts = next(table.texts for table in tables if table.stem == timeless[0])
+        said = next((f" Its {name} holds {shown(cell)}, which is no time that is known: write seconds, or "
+                     "YYYY-MM-DD HH:MM:SS.SSS." for name, cell in texts.items()
+                     if set(re.split("[^a-z]+", name.lower())) & set(TIME_WORDS)), "")
+        return f"no column of {timeless[0]} is surely its time.{said}"
     arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
     for one in columns:
         values = arrays[one.file, one.name]
@@ -350,11 +393,13 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         return "there are neither commands (v, omega) nor wheel speeds."
     if not commands and not _has(roles, "ground_truth", "x", "y"):
         return "there are measured speeds, and neither commands nor an outside pose to compare them with."
-    if not measured and not (_wheels(roles) and _has(roles, "command", "v", "omega")):
+    if not measured and not (_wheels(roles) and commands):
         return "there is neither odometry (v, omega or x, y, yaw) nor an outside pose."
     if unsure := [one for one in columns if not one.sure]:
+        ticks = next((f" If it counts ticks, say how many make a turn: {one.role}={one.file}/{one.name}:N/rev."
+                      for one in unsure if TICKS.search(one.name)), "")
         return f"it is not clear what {', '.join(f'{one.file}/{one.name}' for one in unsure)} " + (
-            "is." if len(unsure) == 1 else "are.")
+            "is." if len(unsure) == 1 else "are.") + ticks
     return ""
 
 
@@ -411,6 +456,11 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     if begin >= end:
         spans = "; ".join(f"{key} {one[0, 0]:.3f} to {one[-1, 0]:.3f} s" for key, one in made.items())
         raise ValueError(f"{source}: the streams of {name} share no time ({spans}). Put them on one clock first.")
+    used = {(one.file, one.name) for one in columns}
+    unused = [f"{table.stem}/{one}" for table in tables for one, values in table.columns.items()
+              if (table.stem, one) not in used and np.nanmin(values) < np.nanmax(values)]
+    if unused:
+        notes.append(f"not used: {', '.join(unused[:NAMED])}{', ...' if len(unused) > NAMED else ''}")
     notes = list(dict.fromkeys(note.removeprefix(f"{name}: ") for note in notes))
     return TextDrive(name, made, tuple(columns), tuple(notes), measured_input)
 
@@ -428,15 +478,18 @@ def _stream(
     mine = [one for one in mine if one.file == file]
     table = next(one for one in tables if one.stem == file)
     clock = next(one for one in columns if one.role == "time" and one.file == file)
-    wheel = {**UNITS["speed"], **UNITS["rate"]}
     found = {"t": table.columns[clock.name] * UNITS["time"][clock.unit]}
     for one in mine:
-        size = (wheel if one.role.endswith(("left", "right")) else UNITS[kind_of(one.role)])[one.unit]
-        found[one.role.partition(".")[2]] = table.columns[one.name] * size
+        found[one.role.partition(".")[2]] = table.columns[one.name] * size_of(one.role, one.unit)
     whole = np.isfinite(list(found.values())).all(axis=0)
     found = {key: values[whole] for key, values in found.items()}
     notes = _check_clock(file, found["t"])
     order = np.argsort(found["t"], kind="stable")
+    if (spread := _spread(found["t"][order])) is not None:
+        step = float(np.median(np.diff(np.unique(found["t"]))))
+        found["t"][order] = spread
+        notes.append(f"{file}: its time is rounded to {step:.3g} s: rows of {stream} at one time are spread evenly "
+                     "until the next")
     later = np.diff(found["t"][order], prepend=-np.inf) > 1e-6
     found = {key: values[order][later] for key, values in found.items()}
     if len(found["t"]) < 2:
@@ -455,6 +508,25 @@ def _stream(
     if "yaw" in found:
         found["yaw"] = np.unwrap(found["yaw"])
     return found, notes
+
+
+def _spread(t: np.ndarray) -> np.ndarray | None:
+    """Times (T,) of rows that came evenly, from times that were rounded down to a coarser step; None where they were
+    not."""
+    first = np.flatnonzero(np.diff(t, prepend=-np.inf) > 1e-6)
+    if len(first) < 3 or len(first) > len(t) / 2:
+        return None
+    stamps, steps = t[first], np.diff(t[first])
+    step = float(np.median(steps))
+    if (np.abs(steps - step) > 1e-3 * step).any() or (np.abs(stamps / step - np.round(stamps / step)) > 1e-3).any():
+        return None
+    apart = step / float(np.median(np.diff(first)))
+    rows = np.arange(len(t))
+    spread = np.interp(rows, first, stamps)
+    before, after = rows < first[1], rows > first[-1]
+    spread[before] = stamps[1] - apart * (first[1] - rows[before])
+    spread[after] = stamps[-1] + np.minimum(apart * (rows[after] - first[-1]), step * (1 - 1e-6))
+    return spread
 
 
 def _check_clock(file: str, t: np.ndarray) -> list[str]:

@@ -89,7 +89,7 @@ class Reference:
         for number in {one.day for one in self.leftovers}:
             mine = [one for one in self.leftovers if one.day == number]
             series = np.stack([self.noise_of(one) for one in mine])
-            white = self.whitener.apply(series, np.stack([one.mask for one in mine])).reshape(len(mine), -1)
+            white = self.whitener.flat(series, np.stack([one.mask for one in mine]))
             courses = np.zeros(len(mine), int)
             for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
                 courses[group] = course

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.quotients import Quotients
-from sysid.replay.records import ODOMETRY, POSE, TURN, Batch, Measured, Plant, Simulated
+from sysid.replay.records import ODOMETRY, POSE, TURN, Batch, FreeVehicle, Measured, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.parameters import get_values, set_values
@@ -170,20 +170,20 @@ def began_at(trial: Trial) -> float:
     return (int(number.group(1)) - 0.5) * ROUND if number else float("nan")
 
 
-def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[Trial, ...],
-                width: float | None = None, paths: PathReplay | None = None, gyro: bool | None = None) -> Drives:
-    """Drives of trials, replayed with the named parameters of `params` free.
+def make_drives(vehicle: FreeVehicle, trials: tuple[Trial, ...], width: float | None = None,
+                paths: PathReplay | None = None, gyro: bool | None = None) -> Drives:
+    """Drives of trials, replayed with the free parameters of a vehicle.
 
     `width`: of the bins [s]; by default what the outside poses allow (`bin_width`).
-    `paths`: the compiled replay of earlier drives with the same plant, parameters and names.
+    `paths`: the compiled replay of earlier drives of the same vehicle.
     `gyro`: whether a gyro is a channel; by default where a trial has one.
     """
     if gyro is False:
         trials = without_gyro(trials)
-    batch, measured = make_batch(trials, plant.dt, RECORD_DT)
-    names = tuple(names)
+    params, names = vehicle.params, vehicle.names
+    batch, measured = make_batch(trials, vehicle.plant.dt, RECORD_DT)
 
-    def vehicle(values: Any) -> Any:
+    def with_free(values: Any) -> Any:
         return set_values(params, names, values)
 
     neutral = {f"{effect.name}.{field}": about.neutral for effect in getattr(params, "effects", ())
@@ -195,7 +195,7 @@ def make_drives(plant: Plant, params: Any, names: Sequence[str], trials: tuple[T
         room += ((names.index(DRAIN), 0.0),)
     courses = _courses(batch, room, shared)
     features = make_features(trials, bin_width(trials) if width is None else width, gyro)
-    paths = paths or PathReplay(plant, vehicle, rows_of_call(10 * len(courses.first)))
+    paths = paths or PathReplay(vehicle.plant, with_free, rows_of_call(10 * len(courses.first)))
     return Drives(trials, names, paths, batch, courses, measured, features,
                   features.of(measured))
 

@@ -81,6 +81,8 @@ class FittedVehicle:
 
     params: Any
     statistics: FitStatistics | None = None
+    kept: bool = True
+    """False where a fit only starts at it."""
 
 
 def load_fitted(path: Path) -> tuple[VehicleSpec, FittedVehicle]:
@@ -125,7 +127,7 @@ def leftovers_in_bins(
 ) -> Leftovers:
     """Statistics of leftovers (B, K, C) with weights of bins (B, K, C) and noise factors (4, C)."""
     whitener = fit_whitener(series, mask)
-    white = whitener.apply(series, mask).reshape(len(trials), -1)
+    white = whitener.flat(series, mask)
     courses = np.zeros(len(trials), int)
     for number, group in enumerate(replicate_groups(trials)):
         courses[group] = number

@@ -70,7 +70,7 @@ def by_own_noise(trials: Sequence[Trial], measured: Measured) -> Measured:
 
 
 def fit_poses(
-    drives: Drives, trials: Sequence[Trial], space: Space, held: np.ndarray, spread: np.ndarray, iterations: int,
+    drives: Drives, space: Space, held: np.ndarray, spread: np.ndarray, iterations: int,
     others: np.ndarray | None = None,
 ) -> np.ndarray | None:
     """Unit coordinates (P,) of the least error in whole poses and speeds; None where the start is best.
@@ -82,17 +82,18 @@ def fit_poses(
         others: (S, P) further starts, in unit coordinates.
     """
     start = space.to_unit(space.initial)
-    noise, measured = estimate_noise(drives.trials), by_own_noise(trials, drives.measured)
+    noise, measured = estimate_noise(drives.trials), by_own_noise(drives.trials, drives.measured)
 
     def objective(at: np.ndarray) -> Objective:
         replay: Any = PoseReplay(drives, held, tuple(space.names), difference_sizes(spread) * space.slope(at))
-        return Objective(replay, space, tuple(trials), measured, noise)
+        return Objective(replay, space, drives.trials, measured, noise)
 
     if noise.source == "defaults":
         noise = objective(start).residual_noise(start)
     elif noise.gyro is not None:
         noise = replace(noise, gyro=objective(start).residual_noise(start).gyro)
     starts = [start] if others is None else [start, *others]
-    fits = [least_squares.fit(objective(one), space, starts=one[None], iterations=iterations) for one in starts]
+    fits = [least_squares.fit(objective(one), starts=one[None],
+                              stop=least_squares.Stopping(iterations)) for one in starts]
     best = min(fits, key=lambda fit: fit.cost)
     return best.u if best.cost < fits[0].initial_cost else None

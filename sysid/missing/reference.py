@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +24,7 @@ from sysid.missing.base_fit import BaseFit
 from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
 from sysid.missing.drives import Drives, make_drives
 from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_in_bins
-from sysid.replay.records import Plant
+from sysid.replay.records import FreeVehicle, Plant
 from sysid.search.result import Progress
 from whill_mjx.vehicle.parameters import set_values
 
@@ -42,32 +41,32 @@ LEAST_DRAWN = 24
 
 
 def make_reference(
-    plant: Plant, start: Any, logs: Sequence[Log], known: bool = True, iterations: int = 15,
-    names: Sequence[str] | None = None, progress: Progress | None = None, fitted: bool = False,
+    vehicle: FreeVehicle, logs: Sequence[Log], known: bool = True, iterations: int = 15,
+    progress: Progress | None = None,
 ) -> Reference:
     """Fit the base model to the training trials of all logs, then each log by itself.
 
     Args:
-        start: `VehicleParams` where the fit starts.
+        vehicle: where the fit starts, with the parameters of the base model free.
         logs: drives of one vehicle, each log of one day.
         known: whether they are reference drives, or the drives in question themselves.
-        fitted: `start` is a vehicle fitted before; it is kept.
+        iterations: of the fit to all; 0 keeps a vehicle that was fitted before.
     """
     spec = logs[0].spec
-    space = make_space(start, spec, names)
+    space = make_space(vehicle.params, spec, vehicle.names)
     trials = tuple(trial for log in logs for trial in log.training)
     day = np.array([number for number, log in enumerate(logs) for _ in log.training])
-    drives = make_drives(plant, start, space.names, trials)
+    drives = make_drives(vehicle, trials)
     groups = replicate_groups_by_day(trials, day)
     whitener = first_scales(drives.target, drives.mask, groups)
     u = space.to_unit(space.initial)
     sizes = difference_sizes(np.diag(assumed_spread(space, u) ** 2))
-    if not fitted:
+    if iterations:
         u = BaseFit(drives, space, whitener, sizes).run(u, iterations, progress=progress)
     at = drives.simulate(space.to_values(u)[None])[0]
     factors = fit_roughness(drives.target - at, drives.mask, roughness(at, drives.features.width, spec.track))
     drives = drives.weighted(at, factors, spec.track)
-    if not fitted:
+    if iterations:
         whitener = fit_whitener(drives.target - at, drives.mask)
         u = BaseFit(drives, space, whitener, sizes).run(u, max(iterations // 2, 3), progress=progress)
     left = drives.target - drives.simulate(space.to_values(u)[None])[0]
@@ -77,7 +76,7 @@ def make_reference(
         prior = (u, np.diag(1 / (3 * assumed_spread(space, u)) ** 2))
         for number, log in enumerate(logs):
             index = np.flatnonzero(day == number)
-            one = drives.of(log.training, plant.dt)
+            one = drives.of(log.training, vehicle.plant.dt)
             one = one.weighted(one.simulate(space.to_values(u)[None])[0], factors, spec.track)
             own = BaseFit(one, space, whitener, sizes).run(u, 6, prior, progress)
             days[number] = own - u
@@ -94,14 +93,13 @@ def make_reference(
     if known:
         whitener = fit_whitener(np.stack([one.series - expected_without(leftovers, one) for one in leftovers]),
                                 drives.mask)
-    params = set_values(start, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
+    params = set_values(vehicle.params, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
     return Reference(params, space, u, spread, days, whitener, factors, leftovers, drives.features.width,
                      known, remark, blocks=blocks)
 
 
 def of_vehicle(
-    plant: Plant, vehicle: FittedVehicle, log: Log, names: Sequence[str] | None = None,
-    progress: Progress | None = None,
+    plant: Plant, vehicle: FittedVehicle, log: Log, names: Sequence[str], progress: Progress | None = None
 ) -> Reference:
     """A vehicle that was fitted before, without drives of it: nothing of the log in question is taken for known.
 
@@ -123,7 +121,7 @@ def of_vehicle(
     gyro = None if known is None else GYRO in known.leftovers.measured
     if gyro is False and any(trial.gyro is not None for trial in log.training):
         remark += "; its fit had no gyro, so that of these drives is left out"
-    drives = make_drives(plant, params, space.names, log.training, width, gyro=gyro)
+    drives = make_drives(FreeVehicle(plant, params, space.names), log.training, width, gyro=gyro)
     at = drives.simulate(space.to_values(u)[None])[0]
     names_of = channel_names(drives.target.shape[-1])
     measured = {name for c, name in enumerate(names_of) if (drives.features.mask[..., c] > 0).any()}

@@ -82,6 +82,15 @@ class Refitter:
         """White features (N, B, n) of parameter sets (N, all), alone in a list."""
         return [self.white(self.drives.simulate(sets))]
 
+    def costs(self, starts: Sequence[Start]) -> np.ndarray:
+        """(N,) costs of joint fits where they start; infinite where a replay is not a number."""
+        if not starts:
+            return np.zeros(0)
+        [seen] = self.replayed(np.stack([self.values_at(one.hypotheses, one.u, one.q) for one in starts]))
+        away = np.stack([one.u for one in starts]) - self.reference.u
+        found = np.square(self.target - seen).sum((1, 2)) + np.einsum("ni,ij,nj->n", away, self.precision, away)
+        return np.where(np.isfinite(found), found, np.inf)
+
     def fit(self, hypotheses: Sequence[Hypothesis], q: np.ndarray, iterations: int = ITERATIONS) -> Refit:
         """Minimise over (u, q) from a start by damped Gauss-Newton, the base parameters from the reference."""
         return self.fit_all([Start(tuple(hypotheses), self.reference.u, q)], iterations)[0]

@@ -31,8 +31,8 @@ def calibration_notes(
     """
     notes = _notes(estimates, spec, trials)
     if kept:
-        notes.append(f"Stated values are kept for {', '.join(kept)}: with free ones, drives that were held back came "
-                     "out no better.")
+        notes.append(f"Stated values are kept for {', '.join(kept)}: free ones did not predict held-back drives "
+                     "better.")
     return notes
 
 

@@ -13,11 +13,13 @@ from sysid.intervals.design import Criterion, Plan, Proposal
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
 from sysid.pages.loop_words import MANOEUVRE_WORDS
-from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, table
+from whill_mjx.io.html import Cell, Section, charts, explained, html_page, paragraph, table
 from whill_mjx.io.svg import PALETTE, Axes, Line, line_chart
 from whill_mjx.logs.dataset import write_text
+from whill_mjx.vehicle.types import Parameter
 
 SHOWN = 12  # candidates listed
+CRITERIA: dict[Criterion, str] = {"a": "least sum of variances", "d": "least volume of the uncertainty"}
 
 
 def text(found: Proposal, criterion: Criterion) -> str:
@@ -32,7 +34,7 @@ def text(found: Proposal, criterion: Criterion) -> str:
     after = chosen[-1].deviation
     lines.append(f"largest uncertainty: {space.names[index]}, {_share(before[index])} of its range; after the drive "
                  f"{_share(after[index])}")
-    lines.append(f"{'manoeuvre':18} {'sum of variances':>17} {'volume (log)':>13}   ({criterion}-optimal first)")
+    lines.append(f"{'manoeuvre':18} {'sum of variances':>17} {'volume (log)':>13}   ({CRITERIA[criterion]} first)")
     lines += [f"{plan.candidate.name:18} {plan.trace:17.4f} {plan.volume:13.2f}" for plan in plans[:SHOWN]]
     blind = blind_parameters(plans, space)
     if blind:
@@ -61,8 +63,8 @@ def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
     return [name for name, deviation in zip(space.names, best, strict=True) if deviation > UNIDENTIFIABLE * PRIOR_SD]
 
 
-def write_page(path: Path, found: Proposal, limits: Limits, config: Any) -> Path:
-    """Write the page, whole or not at all."""
+def write_page(path: Path, found: Proposal, limits: Limits, config: Any, about: dict[str, Parameter]) -> Path:
+    """Write the page, whole or not at all; `about` has meaning and unit of each parameter."""
     chosen, plans, space, before = found.chosen, found.plans, found.space, found.before
     sections = []
     for plan in chosen:
@@ -72,25 +74,28 @@ def write_page(path: Path, found: Proposal, limits: Limits, config: Any) -> Path
                  line_chart([_held(command.t, command.v)], "t [s]", "v [m/s]", "speed", axes),
                  line_chart([_held(command.t, command.omega)], "t [s]", "omega [rad/s]", "yaw rate", axes)]
         x, y, yaw = plan.start
-        sections.append(Section(plan.candidate.name, charts(items) + paragraph(
+        sections.append(Section(in_words(plan.candidate.name).capitalize(), charts(items) + paragraph(
             f"Start {x:.2f} m, {y:.2f} m from the lower left corner, heading {np.rad2deg(yaw):.0f} degrees. The path "
             f"is simulated; the dashed frame keeps {limits.margin:.2f} m for the body.")))
     rows: list[list[str | float | Cell | None]] = [
-        [name, float(space.initial[k]), float(before[k] / PRIOR_SD), float(chosen[-1].deviation[k] / PRIOR_SD)]
-            for k, name in enumerate(space.names)]
+        [explained(name, about[name].description), about[name].unit, float(space.initial[k]),
+         float(before[k] / PRIOR_SD), float(chosen[-1].deviation[k] / PRIOR_SD)]
+        for k, name in enumerate(space.names)]
     ranking: list[list[str | float | Cell | None]] = [
         [plan.candidate.name, float(plan.candidate.command.t[-1]), plan.trace, plan.volume]
         for plan in plans]
     sections += [
-        Section("What it determines", paragraph("Standard deviations as shares of those of the bounds, before and "
-                                           "after the drives; above one half counts as not determined.")
-                + table(["parameter", "value", "before", "after"], rows)),
-        Section("Other manoeuvres", paragraph("Sum of variances relative to now, and logarithm of the volume of the "
-                                              "uncertainty; the less the better.")
+        Section("What it determines", paragraph("Uncertainty of each parameter before and after the drives: 1 is as "
+                                                "much as its bounds allow, and above 0.5 counts as not determined.")
+                + table(["parameter", "unit", "value", "before", "after"], rows)),
+        Section("Other manoeuvres", paragraph(
+            "How much uncertainty each manoeuvre would leave; less is better. Sum of variances: 1 is as now. Volume: "
+            "logarithm of the volume of the uncertainty relative to now. NAME_50 is NAME at half size; prbs is a "
+            "pseudo-random binary sequence.")
                 + table(["manoeuvre", "seconds", "sum of variances", "volume (log)"], ranking))]
     page = html_page(f"Next manoeuvre for {config.vehicle if '/' not in config.vehicle else Path(config.vehicle).name}",
                      sections, f"{limits.room[0]:g} x {limits.room[1]:g} m, {limits.v_min:g} to {limits.v_max:g} m/s, "
-                     f"{limits.omega_max:g} rad/s; criterion {config.criterion.upper()}", kind="Next drive",
+                     f"{limits.omega_max:g} rad/s; chosen by the {CRITERIA[config.criterion]}", kind="Next drive",
                      lead=meaning(chosen, space, before))
     write_text(path, page)
     return path

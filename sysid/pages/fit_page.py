@@ -11,7 +11,19 @@ from sysid.logs.coverage import CHECK
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
-from whill_mjx.io.html import Cell, Section, bullets, charts, heading, legend, number, paragraph, table
+from whill_mjx.io.html import (
+    Cell,
+    Section,
+    bullets,
+    charts,
+    explained,
+    folded,
+    heading,
+    legend,
+    number,
+    paragraph,
+    table,
+)
 from whill_mjx.io.svg import COLOURS, PALETTE, Axes, Line, bar_chart, interval_bar, line_chart, replay_line
 
 REPLAYS = ("ideal", "initial", "fitted")
@@ -194,7 +206,8 @@ def parameters(report: dict[str, Any]) -> str:
         values = (one["value"], low, high, *bounds, one["initial"])
         bar = interval_bar(one["value"], (low, high), (bounds[0], bounds[1]), one["initial"],
                            bounds[0] > 0 and bounds[1] > 10 * bounds[0]) if None not in values else ""
-        rows.append([one["name"], one["unit"], one["initial"], one["value"], low, high, Cell(bar, html=True),
+        name = explained(one["name"], one.get("meaning", ""))
+        rows.append([name, one["unit"], one["initial"], one["value"], low, high, Cell(bar, html=True),
                      Cell("yes" if one["identifiable"] else "no", "good" if one["identifiable"] else "warn"),
                      one["remark"]])
     confidence = report["parameters"][0]["confidence"] if report["parameters"] else 0.9
@@ -205,12 +218,12 @@ def parameters(report: dict[str, Any]) -> str:
     if report["weak_combinations"]:
         parts += [heading("Combinations that this log does not determine"), bullets(report["weak_combinations"])]
     if report.get("spectrum"):
-        parts += [heading("Fisher information"),
-                  table(["combination", "information", "standard error"], [
-                      [one["combination"], one["information"], max(one["information"], 1e-12) ** -0.5]
-                      for one in report["spectrum"]]),
-                  paragraph("Eigenvalues, weakest first; the standard error along each is a share of the range between "
-                            "the bounds.", "dim")]
+        spectrum = table(["combination", "information", "standard error"], [
+            [one["combination"], one["information"], max(one["information"], 1e-12) ** -0.5]
+            for one in report["spectrum"]])
+        parts.append(folded("Fisher information: how well the log determines each combination of parameters", paragraph(
+            "Eigenvalues, weakest first; the standard error along each is a share of the range between the bounds.",
+            "dim") + spectrum))
     if report["fixed"]:
         parts += [heading("Not fitted"), table(["parameter", "value", "reason"], [
             [one["name"], one["value"], one["reason"]] for one in report["fixed"]])]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +30,23 @@ from sysid.search.studies import without_secrets
 from whill_mjx.vehicle.config import VehicleConfig
 
 
-def make_report(
-    log: Log, config: FitConfig, fit: Fit, rows: list[dict[str, Any]], path: str, source: dict[str, Any] | None = None
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Loaded:
+    """A log that was read before, and what its report says of where it came from."""
+
+    log: Log
+    path: str | Path
+    source: dict[str, Any] = field(default_factory=dict)
+    """More to note beside it."""
+
+
+def make_report(data: Loaded, config: FitConfig, fit: Fit, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The report of a fit (keys in `sysid.report`)."""
+    log = data.log
     about = describe_parameters(fit.params)
     parameters = [
-        {"name": one.name, "unit": about[one.name].unit, "initial": one.initial, "value": one.value,
+        {"name": one.name, "meaning": about[one.name].description, "unit": about[one.name].unit,
+         "initial": one.initial, "value": one.value,
          "interval": [one.low, one.high], "confidence": uncertainty.CONFIDENCE,
          "bounds": [float(fit.space.low[i]), float(fit.space.high[i])], "identifiable": one.identifiable,
          "remark": one.remark}
@@ -47,14 +57,14 @@ def make_report(
     ends = fit.coarse if fit.coarse is not None and len(fit.coarse.start_costs) > 1 else fit.search
     return {
         "schema": SCHEMA, "kind": KIND,
-        "dataset": {"name": log.name, "path": path, "sha256": log.sha256, "vehicle": log.spec.name,
+        "dataset": {"name": log.name, "path": str(data.path), "sha256": log.sha256, "vehicle": log.spec.name,
                     "notes": [*log.notes, *thin.notes(fit.space),
                               *calibration_notes(fit.uncertainty.estimates, log.spec, log.training, fit.stated),
                               *(fit.model.notes if fit.model is not None else ())],
                     "training": [trial.name for trial in log.training],
                     "held_out": [trial.name for trial in log.held_out],
                     **({"command_timeout": dict(zip(("value", "low", "high"), found, strict=True))} if (
-                        found := log.fields.get("found_timeout")) else {}), **(source or {})},
+                        found := log.fields.get("found_timeout")) else {}), **data.source},
         "code": code_hashes(),
         "settings": {**asdict(config), "storage": without_secrets(config.storage),
                      "vehicle": None if config.vehicle is None else str(config.vehicle)},
@@ -93,8 +103,8 @@ def provenance(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def fit_dataset(
-    path: str | Path, out: str | Path, quick: bool = False, config: FitConfig | None = None, log: Log | None = None,
-    progress: Progress | None = None, source: dict[str, Any] | None = None, model: Model | None = None,
+    path: str | Path | Loaded, out: str | Path, quick: bool = False, config: FitConfig | None = None,
+    progress: Progress | None = None, model: Model | None = None,
 ) -> dict[str, Any]:
     """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
 
@@ -102,10 +112,8 @@ def fit_dataset(
     file, and vehicle.toml where a vehicle of the simulator drives alike.
 
     Args:
-        path: dataset folder; only named in the report when `log` is given.
+        path: dataset folder, or a log that was read before.
         quick: overrides `config.quick` where true.
-        log: an already loaded log.
-        source: more to note in the report's `dataset`.
         model: as of `fit_log`.
 
     Returns:
@@ -116,7 +124,8 @@ def fit_dataset(
 
     config = config or FitConfig()
     config = replace(config, quick=quick or config.quick)
-    log = of_earlier(load_any(path) if log is None else log, config)
+    data = path if isinstance(path, Loaded) else Loaded(load_any(path), path)
+    log = of_earlier(data.log, config)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     fit = fit_log(log, config, progress, model=model)
@@ -128,12 +137,14 @@ def fit_dataset(
     trials = (*log.training, *log.held_out)
     initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)
-    report = make_report(log, config, fit, rows, str(path), source)
+    report = make_report(replace(data, log=log), config, fit, rows)
     twin = None if fit.model is None or fit.model.vehicle is None else fit.model.vehicle(fit.params, log.spec)
     if isinstance(twin, str):
         report["dataset"]["notes"].append(f"no vehicle of the simulator is written: {twin}")
     elif twin is not None:
-        report["dataset"]["notes"].append(_save_twin(out, twin, fit, log, config, fitted, provenance(report)))
+        replays = _twin_replays(twin, trials, config.physics_dt, fit.frame)
+        _save_twin(out, twin, fit, log, replays[: len(log.training)], provenance(report))
+        report["dataset"]["notes"].append(_twin_note(log, replays, fitted))
     write_report(out / "report.json", report)
     write_plots(out, trials, initial, fitted, rows)
     series = collect(trials, initial, fitted)
@@ -149,39 +160,37 @@ def fit_dataset(
     return report
 
 
-def _save_twin(
-    out: Path, twin: Twin, fit: Fit, log: Log, config: FitConfig, fitted: Sequence[Prediction],
-    origin: dict[str, Any],
-) -> str:
-    """Write the vehicle that drives as a fitted model does, with what its own replays leave of the drives.
-
-    Args:
-        fitted: replays of all trials, training ones first, by the model.
-
-    Returns:
-        How far both are from the drives, as a note.
-    """
-    from whill_mjx.vehicle.vehicle_file import save_vehicle
-
-    trials = (*log.training, *log.held_out)
-    plant = replace(vehicle_plant(twin.spec, VehicleConfig(physics_dt=config.physics_dt)), frame=fit.frame)
+def _twin_replays(twin: Twin, trials: tuple[Trial, ...], physics_dt: float, frame: float | None) -> list[Prediction]:
+    """Replays of trials by the vehicle that drives as a fitted model does; `frame` as of a `Plant` [s]."""
+    plant = replace(vehicle_plant(twin.spec, VehicleConfig(physics_dt=physics_dt)), frame=frame)
     batch, _ = make_batch(trials, plant.dt)
     simulated = Replay(plant, batch, lambda _: twin.params).simulate(np.zeros((1, 1)))
-    seen = predictions(trials, jax.tree.map(lambda leaf: leaf[0], simulated))
+    return predictions(trials, jax.tree.map(lambda leaf: leaf[0], simulated))
+
+
+def _save_twin(out: Path, twin: Twin, fit: Fit, log: Log, replays: Sequence[Prediction], origin: dict[str, Any]
+               ) -> None:
+    """Write the vehicle that drives as a fitted model does, with what its `replays` leave of the training trials."""
+    from whill_mjx.vehicle.vehicle_file import save_vehicle
+
     known = [k for k, name in enumerate(fit.space.names) if name in twin.shared]
     meaning = [twin.shared[fit.space.names[k]] for k in known]
     factors = np.array([factor for _, factor, _ in meaning])
     error = (fit.uncertainty.deviation * fit.space.slope(fit.u))[known] * factors
-    statistics = statistics_of(log.training, seen[: len(log.training)], log.spec.track, [one[0] for one in meaning],
-                               error, fit.uncertainty.covariance[np.ix_(known, known)])
+    statistics = statistics_of(log.training, replays, log.spec.track, [one[0] for one in meaning], error,
+                               fit.uncertainty.covariance[np.ix_(known, known)])
     intervals = {name: (one.low * factor + offset, one.high * factor + offset)
                  for one in fit.uncertainty.estimates if one.identifiable and one.name in twin.shared
                  for name, factor, offset in (twin.shared[one.name],)}
     save_vehicle(out / "vehicle.toml", twin.spec, twin.params, intervals, origin, statistics.as_table())
+
+
+def _twin_note(log: Log, replays: Sequence[Prediction], fitted: Sequence[Prediction]) -> str:
+    """How far the vehicle and the model are from the drives; replays of all trials, training ones first."""
     first = len(log.training) if log.held_out else 0
-    ours, theirs = (np.mean([_distance(trial, replay) for trial, replay in zip(trials[first:], replays[first:],
-                                                                               strict=True)])
-                    for replays in (seen, fitted))
+    trials = (*log.training, *log.held_out)[first:]
+    ours, theirs = (np.mean([_distance(trial, replay) for trial, replay in zip(trials, every[first:], strict=True)])
+                    for every in (replays, fitted))
     return (f"vehicle.toml is the vehicle of the simulator that drives alike: it is {1000 * ours:.2g} mm off in "
             f"{'held-out' if first else 'training'} drives, the model of your file {1000 * theirs:.2g} mm")
 

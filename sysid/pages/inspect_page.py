@@ -17,7 +17,7 @@ STREAMS = {"command": "commands", "odometry": "odometry", "ground_truth": "outsi
 def write_page(path: Path, found: dict[str, Any], picture: Path) -> Path:
     """Write the page of what `sysid.logs.inspection.inspect` found, with its picture inside."""
     log = found["log"]
-    sections = [Section("Is anything odd?", odd(found)), Section("What no fit can find", blind(found))]
+    sections = [Section("Is anything odd?", odd(found)), Section("What this log cannot determine", blind(found))]
     if found.get("next_drives"):
         sections.append(Section("Next drives", next_drives(found["next_drives"])))
     sections += [Section("Pictures", png(picture, "Sampling, excitation, the liveliest trial, and the spread between "
@@ -51,7 +51,8 @@ def odd(found: dict[str, Any]) -> str:
 def blind(found: dict[str, Any]) -> str:
     """What the log cannot determine, why, and the remedy."""
     rows = [[one["hidden"], one["cause"], one["remedy"]] for one in found["blind_spots"]]
-    return table(["hidden", "because", "remedy"], rows) if rows else paragraph("Nothing of what a fit looks for.")
+    header = ["not determined", "because", "remedy"]
+    return table(header, rows) if rows else paragraph("A fit can determine all that it looks for.")
 
 
 def next_drives(drives: list[dict[str, Any]]) -> str:
@@ -59,8 +60,9 @@ def next_drives(drives: list[dict[str, Any]]) -> str:
     rows = [[one["file"], one["manoeuvre"].replace("_", " "), one["why"], one["seconds"], one["v"], one["omega"]]
             for one in drives]
     header = ["file", "manoeuvre", "why", "time [s]", "to v [m/s]", "to omega [rad/s]"]
-    return table(header, rows) + paragraph("Commands are ramped and stay within the room; inspect.txt says where to "
-                                           "start. Keep a hand on the stop.", "dim")
+    return table(header, rows) + paragraph("The drives go up to this speed and yaw rate. Commands are ramped and "
+                                           "stay within the room; inspect.txt says where to start. Keep a hand on the "
+                                           "stop.", "dim")
 
 
 def streams(found: dict[str, Any]) -> str:
@@ -75,7 +77,8 @@ def streams(found: dict[str, Any]) -> str:
                     "repeated"], rows)]
     if late:
         parts.append(table(["what is late", "channel", "delay [ms]", "standard error [ms]", "gain", "trials"], late,
-                           "clock offset plus transport delay, median over trials"))
+                           "Delay: clock offset plus transport delay. Gain: what is late over what it follows. Medians "
+                           "over trials."))
     return "".join(parts)
 
 

@@ -21,6 +21,7 @@ from sysid.pages.loop_words import (
     title,
     vehicles,
 )
+from sysid.pages.verdict_picture import draw
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table
 from whill_mjx.io.svg import PALETTE, Axes, Line, bar_chart, line_chart
 from whill_mjx.logs.dataset import write_text
@@ -38,8 +39,9 @@ def write_page(out: Path, report: dict[str, Any]) -> Path:
     sections = [Section("What was found", found(report))]
     if report["effects"]:
         sections.append(Section("How large it is", effects(report)))
-    if report["weights"]:
-        sections.append(Section("How sure it is", weights(report)))
+    if report["decision"] is not None:
+        caption = "Evidence against chance, what each explanation explains, and its posterior weight"
+        sections.append(Section("How the verdict was reached", charts([draw(report["decision"])], caption)))
     if report["next_manoeuvre"] is not None:
         sections.append(Section("Next drive", next_drive(report["next_manoeuvre"])))
     sections += [Section("All drives", errors(report)), Section("Each manoeuvre", by_manoeuvre(report))]
@@ -95,16 +97,6 @@ def effects(report: dict[str, Any]) -> str:
     return "".join(parts)
 
 
-def weights(report: dict[str, Any]) -> str:
-    """Posterior weights as bars."""
-    words = {"none": "nothing", "noise": "only the noise", "unknown": "something unknown"}
-    named = {words.get(name) or " and ".join(spoken(one) for one in name.split(" + ")): weight
-             for name, weight in report["weights"].items()}
-    chart = bar_chart(list(named), {"weight": list(named.values())}, "posterior weight", log_y=False)
-    return charts([chart], "What is missing: posterior weights of nothing, of effects and pairs of them, and of "
-                           "something that the catalogue does not have")
-
-
 def evidence(report: dict[str, Any]) -> str:
     """What each manoeuvre says of the named effects, and what would have contradicted them."""
     parts = []
@@ -116,8 +108,23 @@ def evidence(report: dict[str, Any]) -> str:
              for each in mine["by_manoeuvre"]],
             f"{spoken(one['name'])}: each manoeuvre by itself (1 agrees with all together), and by how much the size "
             "fitted to the others lowers its squared error, in squared standard deviations of the noise"))
-        parts += [paragraph(agreement(one)), predictions(one)]
+        parts += [paragraph(agreement(one)), form(one["name"], report["forms"].get(one["name"], [])), predictions(one)]
     return "".join(parts)
+
+
+def form(effect: str, curves: list[dict[str, Any]]) -> str:
+    """How far an effect is off its law, over each quantity."""
+    if not curves:
+        return ""
+    drawn = []
+    for one in curves:
+        at, ends = np.asarray(one["at"]), [100 * np.asarray(one[key]) for key in ("low", "high")]
+        lines = [Line(at, np.zeros_like(at), colour=PALETTE[7]), *(Line(at, end, dash="4 3") for end in ends),
+                 Line(at, 100 * np.asarray(one["share"]), width=2.2)]
+        drawn.append(line_chart(lines, f"{one['quantity']} [{one['unit']}]", "off its law [%]", "",
+                                Axes(width=300, height=210)))
+    return charts(drawn, f"{spoken(effect)}: by how much it is larger or smaller than its law says (95 % band dashed). "
+                         "The law holds where the band contains 0")
 
 
 def agreement(effect: dict[str, Any]) -> str:

@@ -31,6 +31,9 @@
                       noise, as a share of it, before and after; share `explained` of what could be predicted; of
                       simulated days that were refitted (`--refit-nulls`, else null) count, calibrated p-value, false
                       alarms and the upper 95 % bound of their rate
+    forms             per named effect curves over speed, yaw rate and time of how much larger than by its law it is:
+                      `share` of its size `at` values of the quantity, with a 95 % band (`low`, `high`)
+    decision          how the verdict was reached, as the picture of the page shows it; null for drives that stand alone
     weights           posterior weights of `none` or `noise`, of sets of effects (" + " between them), of `unknown`
     steps             the sets of effects that were weighed: gain, gain of each effect beside other forms of the others
                       (`own`) and its p-value, what is left that replicates have in common, smooth functions predict, or
@@ -73,7 +76,7 @@ from sysid.errors.noise_level import said
 from sysid.follow_up.calibrated import calibrated
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
-from sysid.follow_up.power import POWER, Days, false_alarms, power_curve, simulated_days, smallest
+from sysid.follow_up.power import DRAWS, POWER, SEED, Days, false_alarms, power_curve, smallest
 from sysid.follow_up.trust import (
     CONFIDENCE,
     advice,
@@ -94,12 +97,15 @@ from sysid.missing.unexplained import held_back_gains
 from sysid.pages.before_after import replayed_paths, shown_drive
 from sysid.pages.loop_words import FAR, describe_unnamed, lead, not_determined, sentence, title
 from sysid.pages.report import code_hashes, error_rows
+from sysid.pages.verdict_picture import account
 from sysid.replay.rollout import predictions
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import as_report as predictions_of
+from sysid.verdict.forms import forms_of
 from sysid.verdict.found import EFFORT
 from sysid.verdict.result import LoopConfig, Result
-from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before
+from sysid.verdict.scan import null_days
+from sysid.verdict.vehicles import drives_of, fitted_after, fitted_alone, fitted_before, refitter_of
 from whill_mjx.effects import EFFECTS, equation
 from whill_mjx.vehicle.parameters import describe, get_values
 from whill_mjx.vehicle.types import Parameter, parameters_of
@@ -124,13 +130,11 @@ def make_report(result: Result) -> dict[str, Any]:
         result, wrench, trials)
     rows = error_rows(trials, before, after)
     refitted_rows = error_rows(trials, before, refitted)
-    days = simulated_days(scanned(result), result.hypotheses, result.reference.spread, result.prepared.wander,
-                          found.scan, seed=result.config.seed)
+    days = new_days(result)
     about = [one.name for one in result.references]
     vehicle = f"the vehicle of {', '.join(about)}" if about else "the vehicle file"
     asked = (f"what has changed or is missing against {vehicle}"
              if result.reference.known else "what the model family lacks")
-    nulls = result.null_refits
     noise = {} if result.noise is None else result.noise.report()
     base = base_table(result)
     same = found.verdict == "none" and not shifts(base) and not (result.floor and result.floor.named)
@@ -152,14 +156,10 @@ def make_report(result: Result) -> dict[str, Any]:
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
         "log_doubts": doubts(result.log), "contradicted": contradicted(result), "pairs": pairs_of(result),
-        "missing": {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
-                    "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
-                    "excess_before": found.excess[0],
-                    "excess_after": found.excess[1], "explained": found.share,
-                    "null_refits": None if nulls is None else {
-                        "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
-                        "upper": nulls.upper}},
+        "missing": missing(result),
         "weights": found.weights, "steps": steps(result),
+        "forms": form_curves(result), "decision": (
+            None if found.findings is None else account(found.findings, result.config.thresholds)),
         "candidates": [[{"effect": one.hypothesis.effect, "variant": one.hypothesis.variant, "gain": one.gain,
                          "p_value": one.p, "explained": one.share,
                          "coordinates": one.refit.q[-len(one.hypothesis.axes):].tolist()} for one in each]
@@ -171,6 +171,14 @@ def make_report(result: Result) -> dict[str, Any]:
         "next_manoeuvre": next_manoeuvre(result), "base": base, "seconds": result.seconds,
         "errors": rows, "manifest": {**settings, "sha256": digest}, "code": code_hashes(),
     }
+
+
+def new_days(result: Result) -> Days:
+    """Days on which nothing is missing, simulated anew for these drives."""
+    evidence, wander = scanned(result), result.prepared.wander
+    nulls = null_days(evidence, result.reference.spread, wander, DRAWS,
+                      np.random.default_rng((result.config.seed, SEED)))
+    return Days(evidence, result.hypotheses, wander, result.search.scan, nulls)
 
 
 def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
@@ -253,6 +261,17 @@ def operating(result: Result, days: Days) -> dict[str, Any]:
                 power.append({"effect": one.effect, "sizes": power_curve(days, number, q, alpha)})
     return {"alpha": alpha, "decisions": EFFORT.rounds + 2, "days": "simulated, linear",
             "false_alarms": false_alarms(days, alpha), "power": power}
+
+
+def missing(result: Result) -> dict[str, Any]:
+    """p-values of "nothing is missing", and what exceeds the noise."""
+    found, nulls = result.search, result.null_refits
+    return {"p_value": calibrated(found.p_value) if result.reference.known else found.p_value,
+            "p_search": found.p_value, "p_pairs": None if found.pairs is None else found.pairs.p_family,
+            "excess_before": found.excess[0], "excess_after": found.excess[1], "explained": found.share,
+            "null_refits": None if nulls is None else {
+                "count": len(nulls.p), "p_value": nulls.p_of(found.p_value), "false_alarms": nulls.alarms,
+                "upper": nulls.upper}}
 
 
 def steps(result: Result) -> list[dict[str, Any]]:
@@ -357,6 +376,19 @@ def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
             "heterogeneity": {"q": agreement.q, "manoeuvres": int(agreement.asked.sum()), "p_value": agreement.p,
                               "scatter": agreement.scatter, "power": agreement.power, "outcome": agreement.outcome},
             "falsifiers": predictions_of(one.falsifiers) if one else []}
+
+
+def form_curves(result: Result) -> dict[str, list[dict[str, Any]]]:
+    """Effect -> curves of how far it is off its law (`sysid.verdict.forms.Deviation`). What its forms leave counts as
+    noise."""
+    found, form = result.search, result.config.thresholds.form
+    if found.verdict != "named" or found.findings is None:
+        return {}
+    final, variants = found.final, tuple(one.key for one in found.final.hypotheses)
+    left = min(one.bent.excess for one in found.findings.sets if one.variants == variants)
+    forms = forms_of(refitter_of(result), final, result.evidence.groups)
+    return {one.effect: [each.report() for each in forms.deviations(form, number, 1 + max(left, 0.0))]
+            for number, one in enumerate(final.hypotheses)}
 
 
 def detectable(result: Result, days: Days) -> list[dict[str, Any]]:

@@ -47,9 +47,9 @@ def operating(report: dict[str, Any]) -> str:
     """False alarms and power of these very drives."""
     one = report["operating"]
     alarms = one["false_alarms"]
-    parts = [paragraph(f"Of {alarms['count']} simulated days with nothing missing the scan takes {alarms['alarms']} "
-                       f"for more (at most {alarms['upper']:.1%} of all, with 95% confidence); each of up to "
-                       f"{one['decisions']} decisions may err in {one['alpha']:.1%}.")]
+    parts = [paragraph(f"On {alarms['alarms']} of {alarms['count']} simulated days with nothing missing, the scan "
+                       f"raises a false alarm (at most {alarms['upper']:.1%} of all, with 95% confidence); each of up "
+                       f"to {one['decisions']} decisions may err with probability {one['alpha']:.1%}.")]
     rows = [[each["effect"], f"{size['factor']:g}", f"{size['noticed']:.0%}"]
             for each in one["power"] for size in each["sizes"]]
     if rows:
@@ -60,7 +60,7 @@ def operating(report: dict[str, Any]) -> str:
 def pairs(report: dict[str, Any]) -> str:
     """The pairs of effects that explain most in the scan."""
     rows = [[" and ".join(one["effects"]), one["gain"], one["p_value"]] for one in report["pairs"]]
-    return table(["two effects", "gain", "p"], rows, "pairs in the scan") if rows else ""
+    return table(["two effects", "gain", "p"], rows, "The pairs of effects that gain most in the scan") if rows else ""
 
 
 def candidates(report: dict[str, Any]) -> str:
@@ -69,13 +69,17 @@ def candidates(report: dict[str, Any]) -> str:
     for number, each in enumerate(report["candidates"], start=1):
         parts.append(table(["effect", "gain", "explains", "p of the gain"],
                            [[f"{one['effect']} {one['variant']}".strip(), one["gain"], f"{one['explained']:.0%}",
-                             one["p_value"]] for one in each], f"round {number}"))
+                             one["p_value"]] for one in each],
+                           f"Round {number}. Gain: fall of the squared error, in variances of the noise. Explains: "
+                           "share of what can be explained. p: how often chance gains as much if nothing is missing."))
     left = ("common", "smooth", "any")
     rows = [[" and ".join(one["effects"]), one["gain"], *(one["left"].get(key, "") for key in left),
              f"{one['share']:.0%}"] for one in report["steps"]]
     if rows:
-        parts.append(table(["effects", "gain", "replicates share", "smooth functions predict", "may be at random",
-                            "share"], rows, "what they gain, and what they leave though it could be predicted"))
+        parts.append(table(["effects", "gain", "left, shared by replicates", "left, predicted by smooth functions",
+                            "left, perhaps at random", "share explained"], rows,
+                           "Sets of effects: their gain, and the error that they leave though it could be predicted, "
+                           "by what shows it. The share compares the gain with both together."))
     return "".join(parts) or paragraph("Nothing stood out, so nothing was refitted.")
 
 
@@ -83,13 +87,13 @@ def noise(report: dict[str, Any]) -> str:
     """Noise of each channel beside that of the reference days."""
     rows = [[name, one["factor"], *one["interval"], "yes" if one["changed"] else ""]
             for name, one in report["noise"].items()]
-    return table(["channel", "noise over that of the reference days", "95% from", "to", "surely another"], rows)
+    return table(["channel", "noise over that of the reference days", "95% from", "to", "surely changed"], rows)
 
 
 def base(report: dict[str, Any]) -> str:
     """Base parameters beside their day-to-day spread: what the last refits made of them."""
-    return table(["parameter", "reference", "day-to-day spread", "refitted before", "after", "unit",
-                  "after is off by [spreads]"],
+    return table(["parameter", "reference days", "day-to-day spread", "refitted before it is in", "and with it", "unit",
+                  "with it, off by [spreads]"],
                  [[one["name"], one["reference"], one["spread"], one["before"], one["after"], one["unit"], one["away"]]
                   for one in report["base"]])
 

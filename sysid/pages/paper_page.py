@@ -42,7 +42,7 @@ class PaperConfig:
     trials: Annotated[int, Range(1, 1_000_000)] = 500
     """Parameter sets that TPE tries."""
     seed: Annotated[int, SEED] = 0
-    """Of TPE."""
+    """Random seed of TPE."""
     channel: Literal["odometry", "ground_truth"] = "odometry"
     """Positions that J compares: the paper's are wheel odometry."""
     physics_dt: Annotated[float, PHYSICS_DT] = 0.005

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import jax
+
+from whill_mjx.processor import cores
 
 _Part = TypeVar("_Part")
 _Done = TypeVar("_Done")
@@ -17,11 +18,6 @@ def on_processor() -> bool:
     """Whether replays run on the host's own cores, each call keeping one busy; an accelerator takes one call after the
     other, and as long for a few rows as for thousands."""
     return jax.default_backend() == "cpu"
-
-
-def cores() -> int:
-    """How many of the host's cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def on_all_cores(work: Callable[[_Part], _Done], parts: Sequence[_Part], compiled: bool = True) -> list[_Done]:

@@ -28,6 +28,7 @@ import numpy as np
 from flax import struct
 
 from sysid.replay.models import Bounds, Model, Parameters, Twin, make_parameters, with_surroundings
+from sysid.replay.records import Plant
 from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
@@ -92,8 +93,8 @@ def mjcf_model(
         world = host.geom_bodyid == 0
         room_fixed = bool((host.geom_type[world] != int(mujoco.mjtGeom.mjGEOM_PLANE)).any())
     params = make_parameters(bounds, room_fixed=room_fixed)
-    plant = with_surroundings(*_functions(robot, entries), dt=float(host.opt.timestep),
-                              wheel_radius=robot.wheel_radius, track=robot.track, drive=RobotDrive(robot, entries))
+    bare = Stepped(robot, entries).plant()
+    plant = with_surroundings(bare, robot.wheel_radius, robot.track, RobotDrive(robot, entries))
 
     def write(folder: Path, params: Parameters) -> Path:
         return write_mjcf(robot, {entries[name]: float(value) for name, value in params.values.items()
@@ -155,39 +156,88 @@ def _searched(
     return bounds, entries
 
 
-def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, Any, Any, Any]:
-    """place, substep, observe and move of `with_surroundings`."""
-    mjx = import_mjx()
-    host, root, speed = robot.host, robot.root, robot.speed
-    try:
-        nominal = mjx.put_model(host)
-    except NotImplementedError as error:
-        raise ValueError(f"{robot.path}: MJX cannot step it: {error} Change or remove this in the file.") from None
-    blank = mjx.make_data(nominal)
-    float_type = jnp.result_type(float)
-    point, ahead = jnp.asarray(robot.point, float_type), jnp.asarray(robot.forward, float_type)
-    rest, activation = jnp.asarray(robot.rest, float_type), jnp.asarray(robot.activation, float_type)
-    sign, wheels = jnp.asarray(robot.sign, float_type), np.array(robot.wheels)
+class Stepped:
+    """A robot stepped by MJX, as functions of one instance: what `with_surroundings` takes."""
 
-    def with_values(params: Parameters) -> Any:
-        model = nominal
-        for name, entry in entries.items():
+    def __init__(self, robot: Robot, entries: Mapping[str, Entry | Size]):
+        self.robot, self.entries, self.mjx = robot, entries, import_mjx()
+        try:
+            self.nominal = self.mjx.put_model(robot.host)
+        except NotImplementedError as error:
+            raise ValueError(f"{robot.path}: MJX cannot step it: {error} Change or remove this in the file.") from None
+        self.blank = self.mjx.make_data(self.nominal)
+        self.float_type = jnp.result_type(float)
+        self.point, self.ahead, self.rest, self.activation, self.sign = (
+            jnp.asarray(one, self.float_type)
+            for one in (robot.point, robot.forward, robot.rest, robot.activation, robot.sign))
+        self.wheels = np.array(robot.wheels)
+
+    def plant(self) -> Plant:
+        """The functions."""
+        return Plant(self.place, self.substep, self.observe, float(self.robot.host.opt.timestep), self.move)
+
+    def place(self, params: Parameters, start: jax.Array) -> Motion:
+        """The robot at rest on its wheels, moved to a start (5,) and driving."""
+        root, speed = self.robot.root, self.robot.speed
+        qpos, qvel = self._at(self.rest, jnp.zeros(self.robot.host.nv, self.float_type), start)
+        v, omega = start[3], start[4]
+        where, heading = self._pose(qpos)
+        arm = qpos[root : root + 3] - where
+        velocity = jnp.stack([v * jnp.cos(heading) - omega * arm[1], v * jnp.sin(heading) + omega * arm[0], 0 * v])
+        inverse = qpos[root + 3 : root + 7] * jnp.array([1.0, -1.0, -1.0, -1.0])
+        rate = _rotate(inverse, jnp.stack([0 * v, 0 * v, omega]))
+        qvel = qvel.at[speed : speed + 3].set(velocity).at[speed + 3 : speed + 6].set(rate)
+        qvel = qvel.at[self.wheels].set(self.sign * self._wheel_speeds(v, omega))
+        return Motion(qpos, qvel, self.activation, jnp.zeros(self.robot.host.nv, self.float_type))
+
+    def substep(self, params: Parameters, state: Motion, command: jax.Array) -> Motion:
+        """The state after one physics step."""
+        robot = self.robot
+        if shares_results() and _may_abort(robot.host):
+            raise ValueError(f"{robot.path}: XLA aborts on contacts of cylinders, boxes and meshes after "
+                             "whill_mjx.share_results(). Leave this call out where an own robot is stepped.")
+        target = self.sign * self._wheel_speeds(command[0], command[1])
+        if robot.motors:
+            target = params.values["drive.kp"] * (target - state.qvel[self.wheels])
+        ctrl = jnp.zeros(robot.host.nu, self.float_type).at[np.array(robot.actuators)].set(target)
+        if robot.integrals:
+            ctrl = ctrl.at[np.array(robot.integrals)].set(self.sign * self._wheel_speeds(command[0], command[1]))
+        data = self.blank.replace(qpos=state.qpos, qvel=state.qvel, act=state.act, qacc_warmstart=state.warm, ctrl=ctrl)
+        data = self.mjx.step(self._with_values(params), data)
+        return Motion(data.qpos, data.qvel, data.act, data.qacc_warmstart)
+
+    def observe(self, state: Motion) -> jax.Array:
+        """(5,) x, y, yaw of the reference point, v and omega that the wheels report."""
+        where, heading = self._pose(state.qpos)
+        left, right = (self.sign * state.qvel[self.wheels] * self.robot.wheel_radius).reshape(2, -1).mean(1)
+        return jnp.stack([where[0], where[1], heading, (left + right) / 2, (right - left) / self.robot.track])
+
+    def move(self, state: Motion, start: jax.Array) -> Motion:
+        """The same motion at the pose of a start (5,)."""
+        qpos, qvel = self._at(state.qpos, state.qvel, start)
+        return state.replace(qpos=qpos, qvel=qvel, warm=jnp.zeros_like(state.warm))  # type: ignore[attr-defined]
+
+    def _with_values(self, params: Parameters) -> Any:
+        model = self.nominal
+        for name, entry in self.entries.items():
             model = model.replace(**entry.changes(model, params.values[name]))
         return model
 
-    def wheel_speeds(v: jax.Array, omega: jax.Array) -> jax.Array:
-        half = omega * robot.track / 2
-        return jnp.stack([v - half, v + half])[robot.sides] / robot.wheel_radius
+    def _wheel_speeds(self, v: jax.Array, omega: jax.Array) -> jax.Array:
+        half = omega * self.robot.track / 2
+        return jnp.stack([v - half, v + half])[self.robot.sides] / self.robot.wheel_radius
 
-    def pose(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _pose(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Reference point (3,) and heading ()."""
+        root = self.robot.root
         quaternion = qpos[root + 3 : root + 7]
-        forward = _rotate(quaternion, ahead)
-        return qpos[root : root + 3] + _rotate(quaternion, point), jnp.arctan2(forward[1], forward[0])
+        forward = _rotate(quaternion, self.ahead)
+        return qpos[root : root + 3] + _rotate(quaternion, self.point), jnp.arctan2(forward[1], forward[0])
 
-    def at(qpos: jax.Array, qvel: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _at(self, qpos: jax.Array, qvel: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The motion turned and moved so that the reference point is at the start."""
-        where, heading = pose(qpos)
+        root, speed = self.robot.root, self.robot.speed
+        where, heading = self._pose(qpos)
         turn = start[2] - heading
         spin = jnp.stack([jnp.cos(turn / 2), 0 * turn, 0 * turn, jnp.sin(turn / 2)])
         arm = _rotate(spin, qpos[root : root + 3] - where)
@@ -195,43 +245,6 @@ def _functions(robot: Robot, entries: Mapping[str, Entry | Size]) -> tuple[Any, 
         attitude = quaternion_product(spin, qpos[root + 3 : root + 7])
         qpos = qpos.at[root : root + 3].set(origin).at[root + 3 : root + 7].set(attitude)
         return qpos, qvel.at[speed : speed + 3].set(_rotate(spin, qvel[speed : speed + 3]))
-
-    def place(params: Parameters, start: jax.Array) -> Motion:
-        qpos, qvel = at(rest, jnp.zeros(host.nv, float_type), start)
-        v, omega = start[3], start[4]
-        where, heading = pose(qpos)
-        arm = qpos[root : root + 3] - where
-        velocity = jnp.stack([v * jnp.cos(heading) - omega * arm[1], v * jnp.sin(heading) + omega * arm[0], 0 * v])
-        inverse = qpos[root + 3 : root + 7] * jnp.array([1.0, -1.0, -1.0, -1.0])
-        rate = _rotate(inverse, jnp.stack([0 * v, 0 * v, omega]))
-        qvel = qvel.at[speed : speed + 3].set(velocity).at[speed + 3 : speed + 6].set(rate)
-        qvel = qvel.at[wheels].set(sign * wheel_speeds(v, omega))
-        return Motion(qpos, qvel, activation, jnp.zeros(host.nv, float_type))
-
-    def substep(params: Parameters, state: Motion, command: jax.Array) -> Motion:
-        if shares_results() and _may_abort(host):
-            raise ValueError(f"{robot.path}: XLA aborts on contacts of cylinders, boxes and meshes after "
-                             "whill_mjx.share_results(). Leave this call out where an own robot is stepped.")
-        target = sign * wheel_speeds(command[0], command[1])
-        if robot.motors:
-            target = params.values["drive.kp"] * (target - state.qvel[wheels])
-        ctrl = jnp.zeros(host.nu, float_type).at[np.array(robot.actuators)].set(target)
-        if robot.integrals:
-            ctrl = ctrl.at[np.array(robot.integrals)].set(sign * wheel_speeds(command[0], command[1]))
-        data = blank.replace(qpos=state.qpos, qvel=state.qvel, act=state.act, qacc_warmstart=state.warm, ctrl=ctrl)
-        data = mjx.step(with_values(params), data)
-        return Motion(data.qpos, data.qvel, data.act, data.qacc_warmstart)
-
-    def observe(state: Motion) -> jax.Array:
-        where, heading = pose(state.qpos)
-        left, right = (sign * state.qvel[wheels] * robot.wheel_radius).reshape(2, -1).mean(1)
-        return jnp.stack([where[0], where[1], heading, (left + right) / 2, (right - left) / robot.track])
-
-    def move(state: Motion, start: jax.Array) -> Motion:
-        qpos, qvel = at(state.qpos, state.qvel, start)
-        return state.replace(qpos=qpos, qvel=qvel, warm=jnp.zeros_like(state.warm))  # type: ignore[attr-defined]
-
-    return place, substep, observe, move
 
 
 def _may_abort(host: mujoco.MjModel) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -273,7 +272,7 @@ def function_model(
     def move(state: jax.Array, start: jax.Array) -> jax.Array:
         return state.at[:3].set(start[:3])
 
-    plant = with_surroundings(place, substep, lambda state: state[:5], move, dt)
+    plant = with_surroundings(Plant(place, substep, lambda state: state[:5], dt, move))
     return Model(name, plant, params).with_effects(effects)
 
 
@@ -290,72 +289,87 @@ class Surrounded:
     diverged: jax.Array  # () bool
 
 
-def with_surroundings(
-    place: Callable[[Parameters, jax.Array], Any], substep: Callable[[Parameters, Any, jax.Array], Any],
-    observe: Callable[[Any], jax.Array], move: Callable[[Any, jax.Array], Any], dt: float, wheel_radius: float = 0.1,
-    track: float = 0.5, drive: Callable[..., np.ndarray] | None = None,
-) -> Plant:
-    """Plant of a bare model: adds the odometry's pose, the effects around it and a guard against what is not finite.
+@dataclass(frozen=True)
+class _Surroundings:
+    """Effects around a bare model, the pose of its odometry, and a guard against what is not finite."""
 
-    Args:
-        place: (params, start (5,)) -> state.
-        substep: (params, state, command (2,)) -> state.
-        observe: state -> (5,) x, y, yaw of the body, v and omega of the odometry.
-        move: (state, start (5,)) -> the same motion at the start's pose.
-        wheel_radius, track: nominal [m]; for effects that count in steps of wheels.
-        drive: as in `Host`, where the host steps it more quickly.
-    """
-    surroundings: Any = SimpleNamespace(dt=dt, wheel_radius=wheel_radius, track=track)
+    bare: Plant
+    wheel_radius: float
+    track: float
 
-    def start_at(params: Parameters, start: jax.Array) -> Surrounded:
-        inner = place(params, start)
+    @property
+    def dt(self) -> float:
+        """Physics step [s]."""
+        return self.bare.dt
+
+    def place(self, params: Parameters, start: jax.Array) -> Surrounded:
+        """The state at a start (5,)."""
+        return self._at_rest(params, start, self.bare.place(params, start))
+
+    def _at_rest(self, params: Parameters, start: jax.Array, inner: Any) -> Surrounded:
         zero = jnp.zeros_like(start[0])
         odometry = Odometry(zero, zero, zero, start[3], start[4], start[4])
         memory = tuple(effect.init() for effect in params.effects)
         return Surrounded(inner, memory, odometry, odometry, jnp.zeros((), bool))
 
-    def advance(params: Parameters, state: Surrounded, command: jax.Array) -> Surrounded:
-        memory, command = apply_chain(params.effects, state.memory, "command", command, surroundings)
-        inner = substep(params, state.inner, command)
-        return read(params, replace(state, memory=memory), inner, observe(inner))
+    def substep(self, params: Parameters, state: Surrounded, command: jax.Array) -> Surrounded:
+        """The state after one physics step."""
+        memory, command = apply_chain(params.effects, state.memory, "command", command, self)
+        inner = self.bare.substep(params, state.inner, command)
+        return self._read(params, replace(state, memory=memory), inner, self.bare.observe(inner))
 
-    def read(params: Parameters, state: Surrounded, inner: Any, seen: jax.Array) -> Surrounded:
+    def _read(self, params: Parameters, state: Surrounded, inner: Any, seen: jax.Array) -> Surrounded:
         healthy = jnp.isfinite(seen).all()
         inner = jax.tree.map(lambda new, old: jnp.where(healthy, new, old), inner, state.inner)
         v, omega = (jnp.where(healthy, seen[i], 0.0) for i in (3, 4))
-        encoder = _integrate(state.encoder, v, omega, dt)
-        memory, reading = apply_chain(params.effects, state.memory, "sensing", encoder, surroundings)
+        encoder = _integrate(state.encoder, v, omega, self.dt)
+        memory, reading = apply_chain(params.effects, state.memory, "sensing", encoder, self)
         return Surrounded(inner, memory, encoder, reading, state.diverged | ~healthy)
 
-    def look(state: Surrounded, observe: Callable[[Any], jax.Array] = observe) -> jax.Array:
-        reading = state.reading
-        reported = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
-        pose = observe(state.inner)[:3]
-        return jnp.concatenate([pose, reported, state.diverged.astype(pose.dtype)[None]])
+    def observe(self, state: Surrounded) -> jax.Array:
+        """(9,) as of `Plant`."""
+        return _reported(state, self.bare.observe(state.inner))
 
-    def shift(state: Surrounded, start: jax.Array) -> Surrounded:
+    def move(self, state: Surrounded, start: jax.Array) -> Surrounded:
+        """The same motion at the pose of a start (5,), with the odometry at its origin."""
         zero = jnp.zeros_like(start[0])
         encoder, reading = (one.replace(x=zero, y=zero, yaw=zero) for one in (state.encoder, state.reading))  # type: ignore[attr-defined]
-        return replace(state, inner=move(state.inner, start), encoder=encoder, reading=reading)
+        return replace(state, inner=self.bare.move(state.inner, start), encoder=encoder, reading=reading)
 
-    def commands(params: Parameters, command: jax.Array) -> jax.Array:
+    def commands(self, params: Parameters, command: jax.Array) -> jax.Array:
+        """Commands (S, 2) after the effects on them."""
         def after(memory: Any, one: jax.Array) -> tuple[Any, jax.Array]:
-            return apply_chain(params.effects, memory, "command", one, surroundings)
+            return apply_chain(params.effects, memory, "command", one, self)
 
         if not any(hasattr(effect, "command") for effect in params.effects):
             return command
         return jax.lax.scan(after, tuple(effect.init() for effect in params.effects), command)[1]
 
-    def begin(params: Parameters, start: jax.Array) -> Surrounded:
-        return replace(start_at(params, start), inner=start)
+    def recorded(self) -> Plant:
+        """Plant of what the host has stepped: a state is what it saw last, a command (6,) what it sees next."""
+        def place(params: Parameters, start: jax.Array) -> Surrounded:
+            return self._at_rest(params, start, start)
 
-    def take(params: Parameters, state: Surrounded, seen: jax.Array) -> Surrounded:
-        after = read(params, state, seen[:5], seen[:5])
-        return replace(after, diverged=after.diverged | (seen[5] > 0.5))
+        def take(params: Parameters, state: Surrounded, seen: jax.Array) -> Surrounded:
+            after = self._read(params, state, seen[:5], seen[:5])
+            return replace(after, diverged=after.diverged | (seen[5] > 0.5))
 
-    recorded = Plant(begin, take, lambda state: look(state, lambda inner: inner), dt, shift)
-    host = None if drive is None else Host(place, commands, drive, recorded)
-    return Plant(start_at, advance, look, dt, shift, host=host)
+        return Plant(place, take, lambda state: _reported(state, state.inner), self.dt, self.move)
+
+
+def with_surroundings(
+    bare: Plant, wheel_radius: float = 0.1, track: float = 0.5, drive: Callable[..., np.ndarray] | None = None
+) -> Plant:
+    """Plant of a bare model: adds the odometry's pose, the effects around it and a guard against what is not finite.
+
+    Args:
+        bare: the model by itself, which observes (5,) x, y, yaw of the body, v and omega of the odometry.
+        wheel_radius, track: nominal [m]; for effects that count in steps of wheels.
+        drive: as in `Host`, where the host steps it more quickly.
+    """
+    around = _Surroundings(bare, wheel_radius, track)
+    host = None if drive is None else Host(bare.place, around.commands, drive, around.recorded())
+    return Plant(around.place, around.substep, around.observe, bare.dt, around.move, host=host)
 
 
 def save_model(
@@ -376,6 +390,13 @@ def save_model(
     if model.write is not None:
         model.write(Path(folder), params)
     return path
+
+
+def _reported(state: Surrounded, seen: jax.Array) -> jax.Array:
+    """(9,) as of `Plant`, of a state and what its bare model observes."""
+    reading, pose = state.reading, seen[:3]
+    reported = jnp.stack([reading.x, reading.y, reading.yaw, reading.v, reading.omega])
+    return jnp.concatenate([pose, reported, state.diverged.astype(pose.dtype)[None]])
 
 
 def _outside(params: Parameters) -> VehicleParams:

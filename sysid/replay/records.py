@@ -60,6 +60,16 @@ class Plant:
     """Whether its steps are arithmetic on single numbers, without products of matrices or solvers."""
 
 
+@dataclass(frozen=True)
+class FreeVehicle:
+    """A vehicle of which some parameters are free."""
+
+    plant: Plant
+    params: Any
+    names: tuple[str, ...]
+    """Of the free ones."""
+
+
 @struct.dataclass
 class Batch:
     """Trials on a common grid; B trials, R records of K physics steps, M measurements (padded)."""

@@ -13,6 +13,7 @@ from sysid.replay.robot_drive import RAMP, SECONDS, SPIN, RobotDrive
 
 ALONE = 0.999  # of the weight on two wheels, from which nothing else carries a robot
 STRAIGHT = 0.1  # share by which the speed may differ from the command
+TURNS = 0.8  # share of the commanded rate on the spot, below which something keeps a robot from turning
 LIGHT = 0.02  # share of the weight below which what touches the floor is not listed
 
 
@@ -125,9 +126,41 @@ def _missing(robot: Robot, check: Check) -> list[str]:
         found.append("it stands on its two driven wheels alone and tips: the file has no caster, or the robot balances "
                      "by a controller of its own, which is not in the file")
     if not check.drives_straight:
-        found.append("it does not drive straight on within a tenth of the commanded speed: check axes of the wheels, "
-                     "what drags on the floor, and friction")
+        found.append("it does not drive straight on within a tenth of the commanded speed: " + (
+            "; ".join(_limits(robot, check.command[0])) or "check axes of the wheels, what drags on the floor, and "
+            "friction"))
+    if len(robot.wheels) == 2 and check.drives_straight and check.rate < TURNS * check.command[1]:
+        names = [name for name in check.loads if int(host.geom_bodyid[host.geom(name).id]) not in wheels]
+        cause = _coupled(robot) or (f"{', '.join(names)} drag sideways. A caster must swivel or slide" if names else
+                                    "check the friction of the wheels")
+        found.append(f"on the spot it reaches only {check.rate / check.command[1]:.0%} of the commanded rate: {cause}")
     return found
+
+
+def _limits(robot: Robot, v: float) -> list[str]:
+    """What of the driven wheels' joints and actuators may keep a robot from a speed [m/s]."""
+    host, found = robot.host, []
+    for joint in _joints(robot):
+        if host.jnt_actfrclimited[joint]:
+            found.append(f"joint {host.joint(joint).name} gives at most {host.jnt_actfrcrange[joint, 1]:.3g} N m "
+                         "(effort, or actuatorfrcrange)")
+    for one in robot.actuators if not robot.motors and not robot.added else ():
+        most = float(np.abs(host.actuator_ctrlrange[one]).max())
+        if host.actuator_ctrllimited[one] and most * robot.wheel_radius < v:
+            found.append(f"actuator {host.actuator(one).name} takes at most {most:.3g} rad/s (ctrlrange), which is "
+                         f"{most * robot.wheel_radius:.3g} m/s")
+    return found
+
+
+def _coupled(robot: Robot) -> str:
+    """A sentence on driven wheels of both sides that a mimic joint lets turn only together; else empty."""
+    host, joints = robot.host, _joints(robot)
+    for number in range(host.neq):
+        ends = {int(host.eq_obj1id[number]), int(host.eq_obj2id[number])}
+        if host.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT and ends == set(joints):
+            names = " and ".join(host.joint(joint).name for joint in joints)
+            return f"joints {names} are coupled (mimic). Leave the coupling out"
+    return ""
 
 
 def _joints(robot: Robot) -> list[int]:

@@ -16,6 +16,7 @@ FIRM_TIME, FIRM, ALONE = [0.01, 1.0], [0.99, 0.99, 0.001, 0.5, 2.0], 1e3
 """solref, solimp and solmix of wheels that a file says nothing of. With MuJoCo's own, one of 33 mm sinks by 0.4 mm, and
 rolls as if its radius were 0.6 % smaller."""
 WATER = 1000.0  # kg/m^3, of a link without a mass, as MuJoCo has it
+ROLLED = 1.02  # of a hub's radius, beyond which rollers on it touch the floor
 DEEP = 0.2  # of the wheel radius below the driven wheels: no caster stands there
 
 
@@ -88,7 +89,10 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
     for body in bodies:
         shapes = [int(host.geom_type[one]) for one in np.flatnonzero(host.geom_bodyid == body)]
         radius, one = reach_of(host, body), spec.body(host.body(body).name)
-        if any(shape in map(int, ROUND) for shape in shapes) or radius == 0.0:
+        solid = max((float(host.geom_size[geom, 0]) for geom in np.flatnonzero(host.geom_bodyid == body)
+                     if int(host.geom_type[geom]) in map(int, ROUND)), default=0.0)
+        rollers = any(joint.parent.name != one.name for joint in one.find_all("joint")) and radius > ROLLED * solid
+        if solid > 0.0 and not rollers or radius == 0.0:
             continue
         if not one.explicitinertial:
             one.explicitinertial, one.mass, one.ipos = True, host.body_mass[body], host.body_ipos[body]
@@ -100,7 +104,7 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
         one.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0.0, 0.0], contype=0, conaffinity=1, mass=0.0,
                      pos=host.jnt_pos[host.body_jntadr[body]], solref=FIRM_TIME, solimp=FIRM, solmix=ALONE,
                      name=one.name)
-        what = "is no cylinder or sphere" if shapes else "has rollers, which are left out"
+        what = "has rollers, which are left out" if rollers or not shapes else "is no cylinder or sphere"
         notes.append(f"{path.name}: wheel {one.name} {what}: it rolls on the {radius:.4g} m by which it reaches from "
                      "its axle")
     return notes

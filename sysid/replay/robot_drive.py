@@ -58,7 +58,7 @@ class RobotDrive:
         return np.concatenate([seen, np.maximum.accumulate(lost, axis=2)[..., None]], axis=-1)
 
     def controls(self, commands: np.ndarray) -> np.ndarray:
-        """What the actuators (..., nu) are told where the robot is told v [m/s], omega [rad/s] (..., 2)."""
+        """Commands (..., nu) of the actuators for the commands v [m/s], omega [rad/s] (..., 2) of the robot."""
         robot, host = self._robot, self._robot.host
         half = commands[..., 1] * robot.track / 2
         control = np.zeros((*commands.shape[:-1], host.nu))

@@ -20,12 +20,18 @@ from sysid.replay import xacro_text
 from sysid.replay.urdf_links import compiler_of, complete_links
 from sysid.replay.xacro_text import around, package_folders
 from whill_mjx.io.reading import LONGEST_REASON, MB, decoded, read_bytes
+from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 MODEL_BYTES = 20 * MB
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
 LONGEST = 60  # s that a xacro file may take, processor time or not
 BOX = 0.1  # m, of a mesh whose body says nothing of its size
+OTHER = "Robots are read from URDF (<robot>), xacro and MJCF (<mujoco>); export it as one of them."
 XACRO = "pip install xacro"
+
+
+mujoco.set_mju_user_warning(lambda text: None)
+"""What is wrong in a model is raised; MuJoCo's own handler writes MUJOCO_LOG.TXT where the command was called."""
 
 
 def read_robot(
@@ -42,7 +48,11 @@ def read_robot(
     try:
         top = ElementTree.fromstring(text)
     except ElementTree.ParseError:
+        if path.suffix not in ROBOT_FILES:
+            raise ValueError(f"{path}: {OTHER}") from None
         return mujoco.MjSpec.from_file(str(path)), [], None  # MuJoCo says where the mistake is
+    if top.tag not in ("robot", "mujoco"):
+        raise ValueError(f"{path}: it begins with <{top.tag[:40]}>. {OTHER}")
     if top.tag != "robot":
         spec = mujoco.MjSpec.from_string(text) if path.suffix == ".xacro" else mujoco.MjSpec.from_file(str(path))
         return spec, [*left_out, *_place_meshes(path, spec)], None

@@ -24,12 +24,13 @@ from sysid.replay.robot_servos import (
     regulate,
     wheel_inertias,
 )
-from sysid.replay.wheels import wheel_joints
+from sysid.replay.wheels import as_plain_wheels, wheel_joints
 from whill_mjx.io.fields import Field, check
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 WHEEL_RADIUS = Field("wheel radius", "m", 1e-3, 2.0,
                      remedy='Sizes are in metres; a mesh in millimetres needs scale="0.001 0.001 0.001".')
+LIGHTEST = 0.5  # m/s^2 of gravity
 STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
 SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
 URDF_STEP = 0.0025  # s; a URDF states none
@@ -108,7 +109,12 @@ class _Draft:
 def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timestep: float | None) -> _Draft:
     """The file with its free joint and names, compiled."""
     spec, notes, stated = read_robot(path, wheels, wheel_radius)
-    joints = wheel_joints(path, spec, wheels)
+    try:
+        joints = wheel_joints(path, spec, wheels)
+    except ValueError as error:
+        missing = "; ".join(note for note in notes if note.endswith("left out"))
+        raise ValueError(f"{error}{f' ({missing}.)' if missing else ''}") from None
+    notes += [*as_plain_wheels(path, spec, joints), *_with_weight(path, spec)]
     if stated is not None:
         if len(joints) == 2:  # the file has none
             spec.option.impratio, spec.option.cone = STIFF, mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -125,6 +131,19 @@ def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timeste
         notes += rounded
         draft.compile()
     return draft
+
+
+def _with_weight(path: Path, spec: Any) -> list[str]:
+    """Let a vehicle stand on its floor by its weight; notes on bodies whose weight a model holds up."""
+    x, y, z = spec.option.gravity
+    if not -z > max(LIGHTEST, abs(x), abs(y)):
+        raise ValueError(f"{path}: option gravity is {x:g} {y:g} {z:g}; a vehicle stands on its floor by gravity along "
+                         "-z. Give it 0 0 -9.81, and z as the axis that points up.")
+    held = [body for body in spec.bodies if body.gravcomp]
+    for body in held:
+        body.gravcomp = 0.0
+    return [f"{path.name}: gravcomp of body {body.name} is left out: it would hold up weight that wheels carry"
+            for body in held]
 
 
 def _drive(draft: _Draft, radius: float, regulated: bool) -> list[int]:
@@ -146,7 +165,9 @@ def _ground(draft: _Draft, radius: float) -> None:
     path, spec, bodies = draft.path, draft.spec, draft.bodies
     if not (draft.host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
         bottom = float(draft.data.xpos[bodies[0], 2]) - radius_of(path, draft.host, bodies[0], radius)
-        spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom],
+        taken = {geom.name for geom in spec.geoms}
+        name = next(one for one in ("floor", *(f"floor_{k}" for k in range(len(taken) + 1))) if one not in taken)
+        spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom],
                                 friction=[0, 0, 0])  # MuJoCo takes the larger one of two geoms
         draft.compile()
     if draft.stated is not None and (low := below_wheels(path, draft.host, draft.data, bodies, radius)):

@@ -72,7 +72,11 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
         encoder, odometry = (one.replace(x=zero, y=zero, yaw=zero) for one in (state.encoder, state.odometry))
         return state.replace(qpos=qpos, qvel=qvel, encoder=encoder, odometry=odometry)
 
-    return Plant(lambda params, start: place(model, params, *start),
+    def at(params: Any, start: jax.Array) -> Any:
+        x, y, yaw, v, omega = start
+        return place(model, params, x, y, yaw, (v, omega))
+
+    return Plant(at,
                  lambda params, state, command: substep(model, params, state, command), observe,
                  config.physics_dt, move,
                  lambda params, state, commands: substeps(model, params, state, commands),

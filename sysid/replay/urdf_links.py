@@ -20,7 +20,7 @@ def complete_links(path: Path, top: ElementTree.Element) -> list[str]:
     Where no link has a shape that touches, and on wheels without one, the visible shape does. A mass of zero is left
     out, so that the shape gives it. Moments of inertia that no body has become those of a ball, or are balanced.
     """
-    notes = []
+    notes = _held_parts(path, top)
     turning = {child.get("link") for joint in top.iter("joint") if joint.get("type") == "continuous"
                and (child := joint.find("child")) is not None}
     bare = top.find("link/collision") is None
@@ -37,6 +37,21 @@ def complete_links(path: Path, top: ElementTree.Element) -> list[str]:
     return notes
 
 
+def _held_parts(path: Path, top: ElementTree.Element) -> list[str]:
+    """Hold parts on joints that move in a plane or freely, which a robot's own parts cannot; a note for each. What
+    moves the whole robot so is the free joint that it gets."""
+    loose = [joint for joint in top.iter("joint") if joint.get("type") in ("planar", "floating")]
+    children = {child.get("link") for joint in top.iter("joint") if (child := joint.find("child")) is not None}
+    notes = []
+    for joint in loose:
+        above = joint.find("parent")
+        parent = "" if above is None else above.get("link", "")
+        if parent in children or top.find(f"link[@name='{parent}']/inertial") is not None:
+            notes.append(f"{path.name}: joint {joint.get('name')} is {joint.get('type')}: its part is held at 0")
+        joint.set("type", "fixed")
+    return notes
+
+
 def compiler_of(top: ElementTree.Element) -> ElementTree.Element:
     """MuJoCo's options of a URDF, made where the file has none."""
     options = top.find("mujoco")
@@ -50,7 +65,8 @@ def _inertial(link: ElementTree.Element, name: str) -> list[str]:
     """Mend the mass and the inertia of a link; sentences on what was changed."""
     inertial = link.find("inertial")
     if inertial is None:
-        return []
+        return [] if link.find("collision") is None else [
+            f"link {name} has no inertial: its shape at the density of water gives its mass"]
     weight, numbers = inertial.find("mass"), inertial.find("inertia")
     mass = 0.0 if weight is None else _number(weight, "value")
     if mass < LEAST:

@@ -16,6 +16,8 @@ PASSIVE = re.compile(r"cast[eo]r|swivel|ball|idler|passive|steer|omni|roller|for
 LEFT = {"left", "l", "fl", "rl", "bl", "ml", "lf", "lr", "lb", "lm", "lh"}
 RIGHT = {"right", "r", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh"}
 WHEEL = re.compile(r"wheel|tyre|tire|whl", re.I)
+SIDEWAYS = re.compile(r"mec[ac]num|omni|swedish", re.I)
+"""Words in the names of wheels, their joints and meshes that let a robot drive sideways."""
 MOST = 3  # wheels on each side
 LEVEL = 0.5  # of an axis along the vertical, or less than which it does not lie across
 UPRIGHT = 0.9  # of an axis along the vertical, from which it steers
@@ -68,6 +70,27 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...
                          "a URDF, hinge in MJCF.")
     raise ValueError(f"{path}: the names do not show which wheels are driven (joints: {', '.join(hinges)}). Name "
                      "them: wheels=(left, right), on the command line --wheels LEFT RIGHT, or all four or six.")
+
+
+def as_plain_wheels(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
+    """Let driven wheels turn without an end; notes on ends that are left out, and on wheels that are no plain ones."""
+    notes, odd = [], []
+    for joint in [one for one in spec.joints if one.name in joints]:
+        if _has_end(joint):
+            low, high = joint.range
+            notes.append(f"{path.name}: wheel joint {joint.name} ends at {low:.3g} and {high:.3g} rad: a wheel turns "
+                         "on, so its ends are left out")
+            joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_FALSE, [0.0, 0.0]
+        body = joint.parent
+        rollers = [one for one in body.find_all("joint") if one.name != joint.name
+                   and one.type == mujoco.mjtJoint.mjJNT_HINGE]
+        named = (joint.name, body.name, *(str(geom.meshname) for geom in body.geoms))
+        if len(rollers) > 2 or any(SIDEWAYS.search(one) for one in named):
+            odd.append(joint.name)
+    if odd:
+        notes.append(f"{path.name}: {', '.join(odd)}: mecanum or omni wheels are taken for plain ones. The model does "
+                     "not drive sideways, and turns as a skid-steered robot; fit drives without sideways commands")
+    return notes
 
 
 @dataclass(frozen=True)

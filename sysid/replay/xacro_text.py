@@ -6,6 +6,7 @@ Files that other packages would include, and their macros, are left out; the err
 
 from __future__ import annotations
 
+import re
 import resource
 import sys
 from pathlib import Path
@@ -26,8 +27,17 @@ def package_folders(folder: Path, package: str) -> list[Path]:
     """Folders of that name, among those around a file, the nearest first."""
     found = []
     for place in around(folder):
-        found += [one for one in (place / package, place) if one.name == package and one.is_dir()]
+        found += [one for one in (place / package, place) if one.is_dir() and package in (one.name, _stated_name(one))]
     return found
+
+
+def _stated_name(folder: Path) -> str:
+    """Name of the package of a folder by its package.xml: a checkout may be called otherwise."""
+    try:
+        found = re.search(r"<name>\s*([\w.-]+)\s*</name>", (folder / "package.xml").read_text(errors="replace"))
+    except OSError:
+        return ""
+    return found[1] if found else ""
 
 
 def expand(path: Path, left_out: list[str]) -> str:

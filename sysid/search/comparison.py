@@ -97,7 +97,7 @@ def trace(
             points = starts.draw(watched, range(effort.starts), judge.track, seed)
             points = starts.fit(watched, points, judge.track, effort.iterations, progress).u[None]
         # As a fit does it, delays included; squares for all, so that the costs are of one kind.
-        gradient_search(watched, space, points, effort.iterations, FitConfig(robust=False), Stages(progress, 2))
+        gradient_search(watched, points, effort.iterations, FitConfig(robust=False), Stages(progress, 2))
     kept = list(recorder.best)
     kept.append((recorder.evaluations, recorder.seconds, *kept[-1][2:]))
     count, seconds, cost, u = (np.array(column) for column in zip(*kept, strict=True))

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
-from sysid.errors.pose_objective import Noise, Objective, Replays, Told, estimate_noise
+from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, Replays, estimate_noise
 from sysid.errors.prior import Prior, bounds_alone, make_prior
 from sysid.errors.robust import robust_cost
 from sysid.errors.space import Space, make_space, searched
@@ -121,7 +121,7 @@ def fit_log(
     scan, coarse, points = _first_points(log, given, config, stages)
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
-    chosen: Told = choose(objective, points[0], log.spec.track, config, stages)
+    chosen: DriveResiduals = choose(objective, points[0], log.spec.track, config, stages)
     robust, search = config.robust and config.method not in GLOBAL, None
     stated: tuple[str, ...] = ()
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
@@ -129,7 +129,7 @@ def fit_log(
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
-        search, chosen, profiles = gradient_search(chosen, space, points, iterations, config, stages)
+        search, chosen, profiles = gradient_search(chosen, points, iterations, config, stages)
         u, final_cost = search.u, search.cost
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
@@ -181,12 +181,11 @@ def _first_points(
 
 def choose(
     objective: Objective, u: np.ndarray, track: float, config: FitConfig, stages: Stages | None = None
-) -> Told:
-    """What a search ends on, whole poses or motion in bins; its prior weighs as often as its squares count what they
-    tell.
+) -> DriveResiduals:
+    """Choose the last objective of a search, whole poses or motion in bins, with the weight of its prior.
 
-    Where the errors of whole poses are those of their sensors alone, from sample to sample, least squares of them are
-    efficient. Disturbances add up along a drive: then their errors go together, and motion in bins tells more.
+    Least squares of whole poses are efficient where only the sensors err, independently in each sample. Disturbances
+    add up along a drive, so the errors of poses are correlated: motion in bins then holds more information.
 
     Args:
         u: (P,) where the search begins, or where that on features ended; a few steps on poses lead on from there.
@@ -195,8 +194,8 @@ def choose(
     if config.method in GLOBAL:
         return objective
     progress = stages.begin("whole poses") if stages else None
-    near = least_squares.fit(objective, objective.space, starts=u[None], iterations=TRIED, robust=config.robust,
-                        progress=progress)
+    near = least_squares.fit(objective, starts=u[None], stop=least_squares.Stopping(TRIED), robust=config.robust,
+                             progress=progress)
     share = uncertainty.inflation(objective, near.u)
     chosen: Objective | FeatureObjective = objective
     if config.method == "features" and share >= TOGETHER:
@@ -270,7 +269,7 @@ def _subject(
         model = wheel_model(log.spec)
     if model is not None:
         if config.vehicle is not None:
-            raise ValueError(f"{config.vehicle}: a vehicle file tells nothing of the model {model.name!r}. Leave "
+            raise ValueError(f"{config.vehicle}: a vehicle file says nothing about the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
         alone: tuple[str, ...] = ()
         model = model.with_effects((*config.effects, *gyro_effects(trials)))

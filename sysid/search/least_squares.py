@@ -43,29 +43,39 @@ class Sums(Protocol):
     def quadratic(self, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
 
 
+@dataclass(frozen=True)
+class Stopping:
+    """When a search ends."""
+
+    iterations: int = 30
+    """At most."""
+    tolerance: float = 1e-4
+    """A start has converged when its cost fell by less than this share twice, and not by GOES_ON times as much in
+    between: where wheels skid or torques meet their limit, costs are jagged."""
+
+
 def fit(
-    objective: Residuals, space: Space, *, starts: np.ndarray | None = None, iterations: int = 30,
-    tolerance: float = 1e-4, robust: bool = False, frozen: tuple[str, ...] = (), progress: Progress | None = None,
+    objective: Residuals, *, starts: np.ndarray | None = None, stop: Stopping = Stopping(),  # noqa: B008
+    robust: bool = False, frozen: tuple[str, ...] = (), progress: Progress | None = None,
 ) -> FitResult:
-    """Minimise the weighted least squares over `space`.
+    """Minimise the weighted least squares over the space of an objective.
 
     Args:
-        objective: residuals and Jacobians in unit coordinates of `space`.
+        objective: residuals and Jacobians in unit coordinates of its space.
         starts: (S, P) unit coordinates; the initial values by default.
-        tolerance: a start has converged when its cost fell by less than this share twice, and not by GOES_ON times as
-            much in between: where wheels skid or torques meet their limit, costs are jagged.
         robust: Huber instead of squares.
         frozen: names that keep each start's value.
     """
+    space = objective.space
     box = BoxStep(free=np.array([name not in frozen for name in space.names]), move=space.moved)
     equations = getattr(objective, "equations", None)
     choices = tuple(Try(factor) for factor in (DAMPINGS if equations is None else MANY_DAMPINGS))
-    solver = GaussNewton(box, choices, Patience(tolerance, times=2, anew=GOES_ON))
+    solver = GaussNewton(box, choices, Patience(stop.tolerance, times=2, anew=GOES_ON))
     descent = _Descent(objective, solver, robust, equations)
     state = solver.init(np.array([space.to_unit(space.initial)] if starts is None else starts, float))
     initial, evaluations = np.inf, 0
     history: list[float] = []
-    for iteration in range(iterations):
+    for iteration in range(stop.iterations):
         going = np.flatnonzero(~solver.done(state))
         part, first, spent = descent.kept(state.of(going))
         initial = float(first[0]) if iteration == 0 else initial
@@ -119,8 +129,8 @@ class _Descent:
             costs = self.equations.costs(tried.points.reshape(-1, size), self.robust) / self.objective.counted
             after = self.solver.step(state, tried, costs.reshape(tried.promised.shape))
             return after, state.cost, len(state.u) + len(costs)
-        slopes = getattr(self.objective, "one_sided", self.objective.jacobian)  # quicker, where an objective has it
-        residual, jacobian = slopes(state.u)
+        differences = getattr(self.objective, "one_sided", self.objective.jacobian)  # quicker, where there are such
+        residual, jacobian = differences(state.u)
         first = robust_cost(residual, self.robust) / self.objective.counted
         state, spent = state._replace(cost=first), len(state.u)
         linear = _Linear(np.arange(spent), residual, jacobian, np.ones(spent, bool))
@@ -216,7 +226,7 @@ class _Tangent:
 
 
 def profile_delays(
-    objective: Residuals, space: Space, u: np.ndarray, robust: bool = False
+    objective: Residuals, u: np.ndarray, robust: bool = False
 ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Cost over a grid of each delay-type parameter, the others following it from u (P,).
 
@@ -226,7 +236,7 @@ def profile_delays(
     Returns:
         Per delay its name, the grid (G,) of its values [s], the costs (G,) and the points (G, P) where they hold.
     """
-    profiles = []
+    profiles, space = [], objective.space
     delays = [index for index, name in enumerate(space.names) if is_delay(name)]
     if not delays:
         return []

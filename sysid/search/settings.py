@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from sysid.errors.prior import SPREAD
 from sysid.search.studies import BATCH
-from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
+from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range, With
 
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
 QUICK_EVALUATIONS = 64
@@ -27,11 +27,11 @@ class FitConfig:
     method: Literal["features", "lm", "tpe", "cmaes", "both"] = "features"
     """features: gradient search on motion in short bins, whitened in the end. lm: on poses. tpe, cmaes: global search.
     both: a short global search that gives the gradient search on poses its starts."""
-    trials: Annotated[int, Range(1, 1_000_000)] = 192
+    trials: Annotated[int, Range(1, 1_000_000), With("method", ("tpe", "cmaes", "both"))] = 192
     """Parameter sets that the global search tries."""
     storage: str = ""
     """Where the global search keeps its study, for several processes at once: journal:FILE or a database URL."""
-    study: str = "fit"
+    study: Annotated[str, With("storage")] = "fit"
     """Name of the study there."""
     starts: Annotated[int, Range(1, 10_000)] = 1
     """Starts of the gradient search: the initial values, and random ones (features: each the best of many) or the best
@@ -64,7 +64,7 @@ class FitConfig:
     """Physics step [s]: with 5 ms a skid that begins errs by several noise scales, and gains and limit with it."""
     vehicle: Path | None = None
     """Vehicle file of an earlier fit: where the search starts, and what is known before (instead of the preset)."""
-    spread: Annotated[float, Range(0, 10, above=True)] = SPREAD
+    spread: Annotated[float, Range(0, 10, above=True), With("vehicle")] = SPREAD
     """With a vehicle file: standard deviation of a parameter from day to day, as a share of its value (assumed)."""
     model: str = ""
     """Another model in place of the simulator's vehicle: an MJCF or URDF file, or FILE.py[:NAME] (docs/fit.md)."""

@@ -2,11 +2,11 @@
 
 Wheels stick or slip, torques meet their limit and delays act in steps: the floor of a cost is jagged, and its slopes
 depend on how far they look. Differences over a fixed share of each parameter's range (`sysid.replay.differences`)
-lead there
-from afar, but one at a time, over many times what a delay errs by and hardly what a sag does: on the floor a search by
-them stops at one of many folds, and they determine some parameters half, others twice as well as the log does. What it
-tells is how residuals differ over all likely values: a plane through them at points drawn from the ellipsoid of the
-errors has those slopes (statistical linearisation; Gelb, 1974, chapter 6), and the ellipsoid comes from the slopes.
+lead there from afar, but one at a time, over many times what a delay errs by and hardly what a sag does: on the floor a
+search by them stops at one of many folds, and they determine some parameters half, others twice as well as the log
+does. What counts is how residuals differ over all likely values: a plane through them at points drawn from the
+ellipsoid of the errors has those slopes (statistical linearisation; Gelb, 1974, chapter 6), and the ellipsoid comes
+from the slopes.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ ROTATIONS = 3
 AT_ONCE = 2**23  # residuals, of points that are replayed together
 REFLECTIONS = 8  # passes over the walls of the box; what is outside still then is moved inwards
 REACH = 0.08
-"""Standard deviation in unit coordinates, at most, over which is averaged: further away lie other valleys."""
+"""Largest standard deviation of the points, in unit coordinates: further away lie other valleys."""
 EXACT = 1e-9
-"""Cost at least, in squared noise scales: a model that is met to the last bit still has an ellipsoid."""
+"""Least cost, in squared noise scales: a model that fits to the last bit still has an ellipsoid."""
 ROUNDS, MISSES, WORTH = 24, 3, 2e-4
-"""Of a descent at most, and after how many in a row it ends that lower the cost by less than that share, or the sum of
-squares by less than one of them: with more, estimates still move by a share of their errors."""
+"""Maximum rounds of a descent; patience; and the share of the cost that a round must gain to count, unless it lowers
+the sum of squares by one. With stricter limits estimates would move by a small share of their errors."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
 SIZES = (1.0, 0.3)
 """Of the ellipsoid, in turn: its own size, and one within which the parameters that move little act linearly."""
@@ -72,8 +72,8 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Moves (N, P) from u (P,) that stay in the unit box.
 
-    A wall reflects those beyond it to where, in the ellipsoid of the covariance, they are as likely: what goes along
-    with a parameter turns back with it.
+    A wall reflects a move beyond it to the point that is as likely in the ellipsoid of the covariance: parameters that
+    are correlated with the reflected one turn back with it.
     """
     moves = moves.copy()
     for _ in range(REFLECTIONS):

@@ -47,13 +47,13 @@ def fit(
         The best point; `start_costs` are those of the first fit, ascending.
     """
     coarse = make_features_objective(objective, track).quicker
-    found = least_squares.fit(coarse, coarse.space, starts=points, iterations=iterations, tolerance=TOLERANCE,
-                         progress=progress)
+    found = least_squares.fit(coarse, starts=points, stop=least_squares.Stopping(iterations, TOLERANCE),
+                              progress=progress)
     fine = coarse.renewed(found.u)
     if fine is coarse:
         return found
-    again = least_squares.fit(fine, fine.space, starts=found.u[None], iterations=max(iterations // 2, 3),
-                         tolerance=TOLERANCE, progress=progress)
+    again = least_squares.fit(fine, starts=found.u[None],
+                              stop=least_squares.Stopping(max(iterations // 2, 3), TOLERANCE), progress=progress)
     return replace(found, u=again.u, evaluations=found.evaluations + again.evaluations)
 
 
@@ -86,8 +86,8 @@ def draw(
     def best_of(tried: np.ndarray, costs: np.ndarray, count: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
         """Where searches from the `count` cheapest of points (S, N, P) with costs (S, N) end, and what that costs."""
         kept = np.take_along_axis(tried, np.argsort(costs, axis=1)[:, :count, None], axis=1)
-        found = least_squares.fit(coarse, space, starts=kept.reshape(-1, space.size), iterations=iterations,
-                             tolerance=TOLERANCE, progress=progress)
+        found = least_squares.fit(coarse, starts=kept.reshape(-1, space.size),
+                                  stop=least_squares.Stopping(iterations, TOLERANCE), progress=progress)
         ends, costs = found.as_given
         return ends.reshape(kept.shape), costs.reshape(kept.shape[:2])
 

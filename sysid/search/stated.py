@@ -15,11 +15,11 @@ from itertools import combinations
 
 import numpy as np
 
-from sysid.errors.pose_objective import Objective, Told
+from sysid.errors.pose_objective import DriveResiduals, Objective
 from sysid.errors.prior import expected_sd
 from sysid.errors.robust import HUBER
 from sysid.errors.space import Space
-from sysid.intervals.independence import Evidence
+from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import PIECES, Uncertainty
 from sysid.search import least_squares
 from sysid.search.gauss_newton import BoxStep
@@ -51,7 +51,8 @@ class Choice:
 
 
 def chosen_sizes(
-    objective: Told, poses: Objective, known: Uncertainty, cost: float, kept: Sequence[str] = (), robust: bool = True
+    objective: DriveResiduals, poses: Objective, known: Uncertainty, cost: float, kept: Sequence[str] = (),
+    robust: bool = True,
 ) -> Choice:
     """The point (P,) at which only those groups differ from what was stated that the drives need.
 
@@ -79,7 +80,8 @@ def chosen_sizes(
         return Choice((), u, cost)
     names = tuple(name for name, one in zip(space.names, held[best], strict=True) if one)
     begin = follow(held[best], np.ones(evidence.scores.shape[:2], bool))
-    found = least_squares.fit(objective, space, starts=begin[None], iterations=ITERATIONS, robust=robust, frozen=names)
+    found = least_squares.fit(objective, starts=begin[None], stop=least_squares.Stopping(ITERATIONS), robust=robust,
+                              frozen=names)
     return Choice(options[best], found.u, found.cost)
 
 
@@ -116,8 +118,8 @@ def simplest(errors: np.ndarray, held: np.ndarray) -> int:
 class _Follow:
     """Where the minimum lies when some drives are left out and some parameters keep their stated value."""
 
-    objective: Told
-    evidence: Evidence
+    objective: DriveResiduals
+    evidence: Information
     stated: np.ndarray  # (P,)
 
     def __call__(self, held: np.ndarray, fitted: np.ndarray) -> np.ndarray:
@@ -138,7 +140,7 @@ class _Follow:
         return box.points(base[None], gradient, hessian, DAMPING)[0]
 
 
-def _folds(evidence: Evidence) -> np.ndarray:
+def _folds(evidence: Information) -> np.ndarray:
     """(B, PIECES) number of the part that each piece is held back with: a manoeuvre, a drive, or half of the only
     one."""
     drives = len(evidence.groups)

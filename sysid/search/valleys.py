@@ -13,8 +13,7 @@ from functools import partial
 import numpy as np
 
 from sysid.errors.bin_objective import FeatureObjective
-from sysid.errors.pose_objective import Told
-from sysid.errors.space import Space
+from sysid.errors.pose_objective import DriveResiduals
 from sysid.search import least_squares, slopes
 from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import FitConfig
@@ -31,9 +30,8 @@ WORTH = 0.001  # share of the cost that another valley must save for the floor t
 
 
 def gradient_search(
-    objective: Told, space: Space, starts: np.ndarray, iterations: int, config: FitConfig,
-    stages: Stages | None,
-) -> tuple[FitResult, Told, list[tuple[str, np.ndarray, np.ndarray]]]:
+    objective: DriveResiduals, starts: np.ndarray, iterations: int, config: FitConfig, stages: Stages | None
+) -> tuple[FitResult, DriveResiduals, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
 
     What drives hardly determine, such as how far a suspension sags, may be right in another valley, and the range
@@ -48,10 +46,10 @@ def gradient_search(
     binned = isinstance(objective, FeatureObjective)
     progress = stages.begin("motion in bins" if binned else "whole poses to the end") if stages else None
 
-    def search(objective: Told, starts: np.ndarray, iterations: int) -> FitResult:
-        return from_all(objective, space, starts, iterations, config.robust, progress)
+    def search(objective: DriveResiduals, starts: np.ndarray, iterations: int) -> FitResult:
+        return from_all(objective, starts, iterations, config.robust, progress)
 
-    def renew(objective: Told, result: FitResult, starts: np.ndarray) -> tuple[Told, FitResult]:
+    def renew(objective: DriveResiduals, result: FitResult, starts: np.ndarray) -> tuple[DriveResiduals, FitResult]:
         """With the noise that the result leaves, searched again from starts (S, P) where that changes it."""
         again = objective.renewed(result.u)
         return (objective, result) if again is objective else (again, search(again, starts, iterations))
@@ -69,10 +67,10 @@ def gradient_search(
         points = points[costs < DEAR * result.cost][:FAR]
         result = _from_elsewhere(follow, result, points, iterations)
         lost = result.cost < LOST * before
-    found = least_squares.profile_delays(objective, space, result.u, robust=config.robust)
+    found = least_squares.profile_delays(objective, result.u, robust=config.robust)
     for name, _, costs, followed in found:
-        here = result.u[space.names.index(name)]
-        apart = np.abs(followed[:, space.names.index(name)] - here) > 1e-6
+        index = objective.space.names.index(name)
+        apart = np.abs(followed[:, index] - result.u[index]) > 1e-6
         if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
             other = followed[apart][costs[apart].argmin()]
             result = _from_elsewhere(follow, result, other[None], iterations)
@@ -91,20 +89,22 @@ def gradient_search(
 
 
 def from_all(
-    objective: Told, space: Space, starts: np.ndarray, iterations: int, robust: bool = False,
+    objective: DriveResiduals, starts: np.ndarray, iterations: int, robust: bool = False,
     progress: Progress | None = None,
 ) -> FitResult:
     """LM from all starts (S, P), on what is quicker as long as that leads on."""
     quicker, spent = getattr(objective, "quicker", objective), 0
     if quicker is not objective:
-        way = least_squares.fit(quicker, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
+        way = least_squares.fit(quicker, starts=starts, stop=least_squares.Stopping(iterations), robust=robust,
+                                progress=progress)
         starts, spent, iterations = way.as_given[0], way.evaluations, min(iterations, LAST)
-    found = least_squares.fit(objective, space, starts=starts, iterations=iterations, robust=robust, progress=progress)
+    found = least_squares.fit(objective, starts=starts, stop=least_squares.Stopping(iterations), robust=robust,
+                              progress=progress)
     return replace(found, evaluations=found.evaluations + spent)
 
 
 def _from_ends(
-    search: Callable[[np.ndarray, int], FitResult], objective: Told, result: FitResult, iterations: int,
+    search: Callable[[np.ndarray, int], FitResult], objective: DriveResiduals, result: FitResult, iterations: int,
     robust: bool,
 ) -> FitResult:
     """The result with where searches from those ends of ranges lead that cost little. An end that costs what is here

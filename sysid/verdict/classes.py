@@ -48,19 +48,3 @@ def _cosine(left: np.ndarray, mine: Sequence[int], other: Columns, size: int) ->
         if own > 1e-9:
             cosines.append(np.sqrt(max(float(cross @ inverse @ cross), 0.0) / own))
     return float(min(min(cosines), 1.0)) if cosines else 0.0
-
-
-def classes(
-    alike: np.ndarray, hypotheses: Sequence[Hypothesis], threshold: float = 0.9, largest: int = 4
-) -> dict[str, list[str]]:
-    """Effect -> itself and the effects that imitate it, nearest first."""
-    out: dict[str, list[str]] = {}
-    for effect in dict.fromkeys(one.effect for one in hypotheses):
-        mine = [i for i, one in enumerate(hypotheses) if one.effect == effect]
-        nearest: dict[str, float] = {}
-        for i in mine:
-            for j, other in enumerate(hypotheses):
-                if other.effect != effect and alike[i, j] > threshold:
-                    nearest[other.effect] = max(nearest.get(other.effect, 0.0), float(alike[i, j]))
-        out[effect] = [effect, *sorted(nearest, key=lambda name: -nearest[name])][:largest]
-    return out

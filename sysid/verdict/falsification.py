@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
@@ -11,7 +12,7 @@ from sysid.logs.records import Trial, command_in_force
 from sysid.missing.joint_fit import Refit, moved_last, without_each
 from sysid.missing.refit import Refitter
 from sysid.verdict.agreement import beside
-from sysid.verdict.falsifiers import QUIET, SPLITS, Course, Tested
+from sysid.verdict.falsifiers import QUIET, SPLITS, BinnedCourse, Tested
 from whill_mjx.effects import card_of
 from whill_mjx.effects.card import Falsifier
 
@@ -21,6 +22,15 @@ POWER = 0.8
 """Least power with which drives must show the opposite for a prediction to count as tested."""
 LEFT = 1.0
 """Largest share of what effects gain that may be left where one does nothing: with more it is not what stands out."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """One prediction of an effect, and the level at which drives must contradict it."""
+
+    effect: str
+    falsifier: Falsifier
+    alpha: float
 
 
 def put_to_test(
@@ -37,21 +47,24 @@ def put_to_test(
     course = course_of(trials, features[0], refitter.drives.features.width, track)
     seen = refitter.drives.mask > 0
     out: list[list[Tested]] = []
-    for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
+    for number, one in enumerate(fit.hypotheses):
         change = features[0] - features[1 + number]  # (B, K, C)
         energy = np.square(refitter.white(change)).reshape(seen.shape).sum(-1)
         tested = card_of(one.effect).forbids
         out.append([])
         for falsifier in tested:
-            alpha = ALPHA / len(tested)
+            law = Law(one.effect, falsifier, ALPHA / len(tested))
             if falsifier.kind == "absent":
                 quiet = QUIET[falsifier.by](course)[..., None] & seen
-                out[-1].append(_absent(one.effect, falsifier, fit, part, refitter.precision, quiet, p_excess, alpha))
+                part = fit.parts[number]
+                gains = (_gain(moved_last(fit, number), part.stop - part.start, refitter.precision),
+                         _gain(fit, len(fit.q), refitter.precision))
+                out[-1].append(_absent(law, fit.residual.reshape(quiet.shape)[quiet], gains, p_excess))
                 continue
             sides = SPLITS[falsifier.by](course, energy)
             parts = np.stack([change * (sides == which)[..., None] for which in (-1.0, 1.0, 0.0)], axis=-1)
-            size, covariance = sizes_in_parts(fit, part, refitter.white(parts), refitter, groups)
-            out[-1].append(_same(one.effect, falsifier, size[:2], covariance[:2, :2], len(groups) - 1, alpha))
+            size, covariance = sizes_in_parts(fit, fit.parts[number], refitter.white(parts), refitter, groups)
+            out[-1].append(_same(law, size[:2], covariance[:2, :2], len(groups) - 1))
     return out
 
 
@@ -85,33 +98,32 @@ def sizes_in_parts(
     return 1 + step[-count:], usual * scale[:, None] * scale
 
 
-def _same(effect: str, falsifier: Falsifier, size: np.ndarray, covariance: np.ndarray, freedom: int, alpha: float
-          ) -> Tested:
+def _same(law: Law, size: np.ndarray, covariance: np.ndarray, freedom: int) -> Tested:
     """Whether the weaker part is surely below `least` of the stronger one."""
+    falsifier = law.falsifier
     weak = int(np.argmin(size))
     contrast = np.full(2, -falsifier.least)
     contrast[weak] = 1.0
     error = float(np.sqrt(contrast @ covariance @ contrast))
-    law = stats.t(max(freedom, 1))
-    p = float(min(2 * law.cdf(float(contrast @ size) / error), 1.0))  # the weaker of two was picked
-    power = float(law.cdf((falsifier.least - falsifier.else_) / error + law.ppf(alpha / 2)))
-    outcome = "falsified" if p < alpha else "holds" if power >= POWER else "untold"
-    return Tested(effect, falsifier, outcome, tuple(size.tolist()), error, p, power)
+    t = stats.t(max(freedom, 1))
+    p = float(min(2 * t.cdf(float(contrast @ size) / error), 1.0))  # the weaker of two was picked
+    power = float(t.cdf((falsifier.least - falsifier.else_) / error + t.ppf(law.alpha / 2)))
+    outcome = "falsified" if p < law.alpha else "holds" if power >= POWER else "untold"
+    return Tested(law.effect, falsifier, outcome, tuple(size.tolist()), error, p, power)
 
 
 def _absent(
-    effect: str, falsifier: Falsifier, fit: Refit, part: slice, precision: np.ndarray, quiet: np.ndarray,
-    p_excess: Callable[[float], float], alpha: float,
+    law: Law, residual: np.ndarray, gains: tuple[float, float], p_excess: Callable[[float], float]
 ) -> Tested:
-    """Whether what is left in bins (B, K, C) where an effect does nothing is too much for it to be what is missing."""
-    count = float(quiet.sum())
-    left = float(np.square(fit.residual.reshape(quiet.shape)[quiet]).sum()) - count
-    gain = _gain(moved_last(fit, fit.parts.index(part)), part.stop - part.start, precision)
-    p = float(p_excess(left / count)) if count else 1.0
-    share = left / _gain(fit, len(fit.q), precision)
-    visible = count > 0 and p_excess(gain / count) < alpha  # had it all been left there, it would have been seen
-    outcome = "falsified" if p < alpha and share > LEFT else "holds" if visible else "untold"
-    return Tested(effect, falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / gain), p,
+    """Whether the residual (N,) where an effect does nothing is too large for it to be what is missing; `gains` has by
+    how much it alone and all effects lower the cost."""
+    count = float(len(residual))
+    left = float(np.square(residual).sum()) - count
+    own, every = gains
+    p, share = float(p_excess(left / count)) if count else 1.0, left / every
+    visible = count > 0 and p_excess(own / count) < law.alpha  # had it all been left there, it would have been seen
+    outcome = "falsified" if p < law.alpha and share > LEFT else "holds" if visible else "untold"
+    return Tested(law.effect, law.falsifier, outcome, (share,), float(np.sqrt(2 * max(count, 1.0)) / own), p,
                   1.0 if visible else 0.0)
 
 
@@ -121,7 +133,7 @@ def _gain(fit: Refit, count: int, precision: np.ndarray) -> float:
     return max(float(q @ beside(fit.products(precision), count) @ q), 1e-9)
 
 
-def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, track: float) -> Course:
+def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, track: float) -> BinnedCourse:
     """The course of trials, from simulated features (B, K, 5) and their commands."""
     bins = simulated.shape[1]
     t = (np.arange(bins) + 0.5) * width
@@ -131,7 +143,7 @@ def course_of(trials: Sequence[Trial], simulated: np.ndarray, width: float, trac
     heading = start + np.cumsum(omega * width, axis=1) - omega * width / 2
     rows = [_changes(trial, t, track) for trial in trials]
     asked, step, rising, since = (np.stack([row[k] for row in rows]) for k in range(4))
-    return Course(t, v, omega * track / 2, omega, heading, asked, step, rising, since)
+    return BinnedCourse(t, v, omega * track / 2, omega, heading, asked, step, rising, since)
 
 
 def _changes(trial: Trial, t: np.ndarray, track: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

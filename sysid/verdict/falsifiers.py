@@ -32,7 +32,7 @@ MOVING = 0.02
 
 
 @dataclass(frozen=True)
-class Course:
+class BinnedCourse:
     """What B trials do in K bins, as the refitted model drives them."""
 
     t: np.ndarray  # (K,) s, middle of the bins
@@ -75,7 +75,7 @@ def way(values: np.ndarray, least: float) -> np.ndarray:
     return np.where(np.abs(values) < least, 0.0, np.sign(values))
 
 
-SPLITS: Mapping[str, Callable[[Course, np.ndarray], np.ndarray]] = {
+SPLITS: Mapping[str, Callable[[BinnedCourse, np.ndarray], np.ndarray]] = {
     "speed": lambda course, energy: side(np.abs(course.v), energy),
     "yaw rate": lambda course, energy: side(np.abs(course.omega), energy),
     "direction of travel": lambda course, energy: way(course.v, MOVING),
@@ -89,7 +89,7 @@ SPLITS: Mapping[str, Callable[[Course, np.ndarray], np.ndarray]] = {
 }
 """Sides (B, K) -1 and 1 of a quantity, 0 where it has none, from the course and the effect's energy (B, K)."""
 
-QUIET: Mapping[str, Callable[[Course], np.ndarray]] = {
+QUIET: Mapping[str, Callable[[BinnedCourse], np.ndarray]] = {
     "constant command": lambda course: course.since >= SETTLED,
     "straight": lambda course: (np.abs(course.omega) < STRAIGHT) & (course.since >= SETTLED),
 }

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,39 @@ from sysid.missing.joint_fit import Refit, Replays, without_each
 
 MOST = 2.0
 """Largest size of a modulation: it is 1 at the 90 % quantile of the speed."""
+QUANTITIES = (("speed", "m/s"), ("yaw rate", "rad/s"), ("time in the drive", "s"))
+"""What the form of an effect may depend on, with its unit."""
+POINTS = 41
+"""Points of a curve over one of them."""
+CONFIDENCE = 1.96
+"""Standard deviations to the ends of a 95 % band."""
 RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What drives cover of each of `QUANTITIES`."""
+
+    ends: np.ndarray  # (3, 2)
+    scale: np.ndarray  # (3,)
+    middle: np.ndarray  # (3,) where it counts as 0
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How much larger than by its law an effect is, over one quantity."""
+
+    quantity: str
+    unit: str
+    at: np.ndarray  # (G,)
+    share: np.ndarray  # (G,) of the size of the effect
+    error: np.ndarray  # (G,) standard deviations
+
+    def report(self) -> dict[str, Any]:
+        """The curve for report.json, with its 95 % band."""
+        low, high = self.share - CONFIDENCE * self.error, self.share + CONFIDENCE * self.error
+        return {"quantity": self.quantity, "unit": self.unit, "at": self.at.tolist(), "share": self.share.tolist(),
+                "low": low.tolist(), "high": high.tolist()}
 
 
 @dataclass(frozen=True)
@@ -31,6 +64,10 @@ class Forms:
     bent: tuple[np.ndarray, ...]  # per effect (n, m): the same in other forms, together as large as it is
     precision: np.ndarray  # (P, P) of the base parameters
     shape: tuple[int, ...]  # (B, n / B) of the residual
+    units: tuple[float, ...]
+    """Per effect: factor on its modulations that makes them together as large as it is."""
+    centres: tuple[np.ndarray, ...]  # per effect (7,): means of the modulations by `QUANTITIES`, where it acts
+    motion: Motion
 
     def left(self, form: float) -> np.ndarray:
         """(B, n / B) what is left where all effects may have other forms.
@@ -60,6 +97,28 @@ class Forms:
             costs.append(float(target @ target - target @ design @ solution))
             apart.append(self._left_out(design, self._prior(columns, bent, form), target, groups))
         return max(costs[0] - costs[1], 0.0), apart[0] - apart[1]
+
+    def deviations(self, form: float, number: int, noise: float = 1.0) -> list[Deviation]:
+        """How far one of the effects is off the catalogue's law over speed, yaw rate and time, of its mean size.
+
+        Args:
+            noise: variance of the white residual.
+        """
+        columns, before = [self.base, *self.sizes], sum(one.shape[1] for one in self.bent[:number])
+        solution, design = self._solved(columns, self.bent, form, self.target)
+        covariance = _solve(design.T @ design + self._prior(columns, self.bent, form), np.eye(design.shape[1])) * noise
+        start = first = sum(one.shape[1] for one in columns) + before
+        out = []
+        for (name, unit), (low, high), scale, middle in zip(
+                QUANTITIES, self.motion.ends, self.motion.scale, self.motion.middle, strict=True):
+            at = np.linspace(low, high, POINTS)
+            basis = shapes((at - middle) / scale, name)
+            index = slice(first, first + basis.shape[-1])
+            basis = self.units[number] * (basis - self.centres[number][first - start : index.stop - start])
+            error = np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance[index, index], basis))
+            out.append(Deviation(name, unit, at, basis @ solution[index], error))
+            first = index.stop
+        return out
 
     def _prior(self, plain: Sequence[np.ndarray], bent: Sequence[np.ndarray], form: float) -> np.ndarray:
         """(F, F) precision of the columns."""
@@ -93,26 +152,51 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 def forms_of(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:
     """Other forms of the effects of a joint fit; `groups` has the trials of each manoeuvre."""
     whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
+    motion = motion_of(whole, refitter.drives.features.width)
     changes = [refitter.white(whole - one) for one in less]
     bent = [refitter.white(modulated(whole - one, whole, groups)) for one in less]
-    bent = [one * (np.square(change).sum() / max(np.square(one).sum(), 1e-12)) ** 0.5
-            for one, change in zip(bent, changes, strict=True)]
+    units = [float((np.square(change).sum() / max(np.square(one).sum(), 1e-12)) ** 0.5)
+             for one, change in zip(bent, changes, strict=True)]
+    energy = [np.square(change).reshape(whole.shape).sum(-1) for change in changes]  # (B, K)
+    centres = [np.einsum("bk,bkm->m", one, factors_of(whole)) / max(float(one.sum()), 1e-12) for one in energy]
     size, count = len(fit.u), fit.residual.size
     columns = fit.jacobian.reshape(count, -1)
     target = fit.residual.reshape(-1) + columns[:, :size] @ (fit.u - refitter.reference.u)
     return Forms(target, columns[:, :size], tuple(columns[:, size + one.start : size + one.stop] for one in fit.parts),
-                 tuple(one.reshape(-1) for one in changes), tuple(one.reshape(count, -1) for one in bent),
-                 refitter.precision, fit.residual.shape)
+                 tuple(one.reshape(-1) for one in changes),
+                 tuple(unit * one.reshape(count, -1) for unit, one in zip(units, bent, strict=True)),
+                 refitter.precision, fit.residual.shape, tuple(units), tuple(centres), motion)
 
 
-def modulated(change: np.ndarray, motion: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:
-    """What an effect changes, `change` (B, K, C), in other forms (B, K, C, m): in proportion to functions of the
-    features `motion` (B, K, C) and of time, shifted in time, and of a size of its own in each manoeuvre."""
-    scale = np.maximum(np.quantile(np.abs(motion[..., :2]), 0.9, axis=(0, 1)), 1e-6)
-    v, omega = np.moveaxis(motion[..., :2] / scale, -1, 0)
-    time = np.broadcast_to(np.linspace(-1.0, 1.0, motion.shape[1]), v.shape)
-    factors = [np.clip(one, -MOST, MOST) for one in (v, np.abs(v), v**2, omega, np.abs(omega), omega**2, time)]
-    factors += [np.isin(np.arange(len(v)), group)[:, None] * np.ones_like(v) for group in groups]
+def motion_of(features: np.ndarray, width: float = 1.0) -> Motion:
+    """Ranges of the features (B, K, C) of drives, in bins of `width` [s]."""
+    speeds = features[..., :2].reshape(-1, 2)
+    scale = np.maximum(np.quantile(np.abs(speeds), 0.9, axis=0), 1e-6)
+    end = features.shape[1] * width
+    ends = np.concatenate([np.quantile(speeds, [0.01, 0.99], axis=0).T, [[0.0, end]]])
+    return Motion(ends, np.append(scale, end / 2), np.array([0.0, 0.0, end / 2]))
+
+
+def shapes(x: np.ndarray, quantity: str) -> np.ndarray:
+    """(..., m) functions of a scaled quantity (...) by which an effect may be larger or smaller than its law says."""
+    parts = (x,) if quantity == "time in the drive" else (x, np.abs(x), x**2)
+    return np.stack([np.clip(one, -MOST, MOST) for one in parts], -1)
+
+
+def factors_of(features: np.ndarray) -> np.ndarray:
+    """(B, K, 7) functions of `QUANTITIES` in drives with these features (B, K, C)."""
+    v, omega = np.moveaxis(features[..., :2] / motion_of(features).scale[:2], -1, 0)
+    time = np.broadcast_to(np.linspace(-1.0, 1.0, v.shape[1]), v.shape)
+    return np.concatenate([shapes(one, name) for one, (name, _) in zip((v, omega, time), QUANTITIES, strict=True)], -1)
+
+
+def modulated(change: np.ndarray, features: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:
+    """What an effect changes, `change` (B, K, C), in other forms (B, K, C, m): in proportion to functions of `features`
+    (B, K, C) and of time, of a size of its own in each manoeuvre, and shifted in time."""
+    manoeuvres = [np.isin(np.arange(len(change)), group)[:, None, None] * np.ones((*change.shape[:2], 1))
+                  for group in groups]
     early, late = np.zeros_like(change), np.zeros_like(change)
     early[:, :-1], late[:, 1:] = change[:, 1:], change[:, :-1]
-    return np.stack([*(change * one[..., None] for one in factors), (early - late) / 2, early + late - 2 * change], -1)
+    shifted = np.stack([(early - late) / 2, early + late - 2 * change], -1)
+    factors = np.concatenate([factors_of(features), *manoeuvres], -1)[:, :, None]
+    return np.concatenate([change[..., None] * factors, shifted], -1)

@@ -104,20 +104,18 @@ class Scan:
         return family(self.smallest, float(tail(self.null[:, h], worth)))
 
 
-def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray | float:
-    """P(null >= value), beyond the draws by an exponential tail through their upper tenth."""
-    from scipy import stats
+def tail(null: np.ndarray, value: np.ndarray | float, least: float = 1e-9) -> np.ndarray:
+    """P(null >= value); beyond the draws (N,) by an exponential tail through their upper tenth.
 
-    value = np.asarray(value, float)
-    ordered = np.sort(null)
+    Args:
+        least: value over which that tail falls by e, at least.
+    """
+    value, ordered = np.asarray(value, float), np.sort(null)
     count = len(ordered)
     empirical = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
     top = ordered[int(0.9 * count) :]
-    start = top[0]
-    excess = np.maximum(top - start, 0.0)
-    scale = max(float(excess.mean()), 1e-9)
-    far = 0.1 * stats.expon.sf(value - start, scale=scale)
-    return np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), empirical)
+    far = 0.1 * np.exp(-np.maximum(value - top[0], 0.0) / max(float(top.mean() - top[0]), least))
+    return np.asarray(np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), empirical))
 
 
 def family(smallest: np.ndarray, p: float) -> float:

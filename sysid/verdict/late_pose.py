@@ -74,25 +74,22 @@ def yaw_rates(log: Log) -> Rates | None:
 
 def residuals(result: Result, values: np.ndarray) -> np.ndarray:
     """White residuals (N, B, n) of the binned drives with values (N, all)."""
-
     reference = result.reference
     drives, before = drives_of(result, result.log.training, reference.params)
     at = drives.simulate(before[None])[0]
     drives = drives.weighted(at, reference.factors, result.log.spec.track)
-    left = [reference.whitener.apply(reference.target_of(drives) - one, drives.mask) for one in drives.simulate(values)]
-    return np.stack([one.reshape(len(one), -1) for one in left])
+    target = reference.target_of(drives)
+    return np.stack([reference.whitener.flat(target - one, drives.mask) for one in drives.simulate(values)])
 
 
 def fitted(result: Result, delay: float) -> np.ndarray:
     """Values (all,) of the base model fitted to whole poses that are late by `delay` [s]."""
-
-
     names, reference = list(result.names), result.reference
     drives, values = drives_of(result, result.log.training, fitted_before(result))
     values = with_values(values, names, {PARAMETER: delay})
     vehicle = set_values(result.full, names, jnp.asarray(values, jnp.result_type(float)))
     space = make_space(vehicle, result.log.spec, list(reference.space.names))
     first = space.to_unit(reference.space.initial)
-    u = fit_poses(drives, result.log.training, space, values, reference.spread, ITERATIONS, first[None])
+    u = fit_poses(drives, space, values, reference.spread, ITERATIONS, first[None])
     found = space.to_values(space.to_unit(space.initial) if u is None else u)
     return with_values(values, names, dict(zip(space.names, found.tolist(), strict=True)))

@@ -16,31 +16,29 @@ import numpy as np
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander
 from sysid.missing.evidence import RIDGE, Columns, Evidence, Solver
-from sysid.verdict.found import PairScan
-from sysid.verdict.scan import REACH, null_moments
+from sysid.verdict.found import PairScan, tail
+from sysid.verdict.scan import REACH, NullDays
 
 DRAWS = 300
 """Simulated nulls for the p-values of pairs: each is asked of some ten thousand columns."""
 TOGETHER = 256
 """Pairs of columns that are solved in one call."""
 CHI_SQUARED = 2.0
-"""Size over which the tail of chi-squared falls by e."""
+"""Worth over which the tail of chi-squared falls by e. That of a pair is no steeper: many are 0 on nearly all nulls."""
 
 
-class Bench:
+class PairSolver:
     """Scores and information of all columns beside the base, of the drives (row 0) and of simulated nulls."""
 
-    def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, moments: np.ndarray,
-                 share: np.ndarray):
-        """`moments` (N, P + S) of the nulls; `share` (N, D) of the reference days' apparent effects in each."""
+    def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, nulls: NullDays):
         solver, self.size = Solver(evidence), evidence.base_size
         size = self.size
         self.left = solver.products[size:, size:] - solver.products[:size, size:].T @ solver.project[:, size:]
         self.left[np.diag_indices(len(self.left))] += RIDGE * np.maximum(np.diag(solver.products)[size:], 1e-12)
-        every = np.concatenate([solver.moments[None], moments])
+        every = np.concatenate([solver.moments[None], nulls.moments])
         self.score = every[:, size:] - every[:, :size] @ solver.project[:, size:]  # (1 + N, S)
         self.columns, self.wander = evidence.columns, wander.covariance
-        away = [wander.away(number, share) for number in range(len(wander.shapes))]
+        away = [wander.away(number, nulls.share) for number in range(len(wander.shapes))]
         self.away = [np.concatenate([np.zeros((1, one.shape[1])), one]) for one in away]  # the drives' own is 0
         self.ends = [_ends(one, hypotheses[one.hypothesis]) for one in evidence.columns]
 
@@ -68,50 +66,36 @@ def _ends(columns: Columns, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndar
     return low - 1e-9, np.array([axis.limit if axis.signed else REACH * columns.level for axis in hypothesis.axes])
 
 
-def tail(null: np.ndarray, value: np.ndarray | float) -> np.ndarray:
-    """P(null >= value); beyond the upper tenth of the draws (N,) at most as steep as that of chi-squared, because the
-    worth of many pairs is 0 on nearly all of them."""
-    value, ordered = np.asarray(value, float), np.sort(null)
-    count = len(ordered)
-    p = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
-    top = ordered[int(0.9 * count) :]
-    far = 0.1 * np.exp(-(value - top[0]) / max(float(top.mean() - top[0]), CHI_SQUARED))
-    return np.asarray(np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), p))
-
-
 def scan_pairs(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], spread: np.ndarray, wander: Wander, similar: np.ndarray,
-    alike: float, draws: int = DRAWS, seed: int = 0,
+    evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, nulls: NullDays, similar: np.ndarray,
+    alike: float,
 ) -> PairScan:
     """Scan all pairs of different effects that these drives separate, and calibrate on simulated nulls.
 
     Args:
-        spread: (P, P) day-to-day covariance of the base parameters.
+        nulls: days without any effect, which calibrate the p-values.
         similar: (H, H) |cos| of signatures; pairs above `alike` are one class, not two effects.
     """
-    rng = np.random.default_rng((seed, 2))
-    moments = null_moments(evidence, spread, draws, rng)
-    share = wander.draw_shares(draws, rng)
     members = tuple((i, j) for i, j in combinations(range(len(hypotheses)), 2)
                     if hypotheses[i].effect != hypotheses[j].effect and max(similar[i, j], similar[j, i]) <= alike)
-    gain, worth, found, null = _looked(Bench(evidence, hypotheses, wander, moments, share), hypotheses, members)
-    p, smallest = np.ones(len(members)), np.ones(draws)
+    gain, worth, found, null = _looked(PairSolver(evidence, hypotheses, wander, nulls), hypotheses, members)
+    p, smallest = np.ones(len(members)), np.ones(len(null))
     for m in range(len(members)):
-        p[m] = float(tail(null[:, m], worth[m]))
-        smallest = np.minimum(smallest, tail(null[:, m], null[:, m]))
+        p[m] = float(tail(null[:, m], worth[m], CHI_SQUARED))
+        smallest = np.minimum(smallest, tail(null[:, m], null[:, m], CHI_SQUARED))
     return PairScan(members, gain, worth, found, p, smallest, null)
 
 
 def scan_again(first: PairScan, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander) -> PairScan:
     """The same pairs on other drives of the same commands, held against the nulls of a scan made before."""
-    nothing = np.zeros((0, evidence.products.shape[1])), np.zeros((0, len(wander.shapes[0])))
-    gain, worth, found, _ = _looked(Bench(evidence, hypotheses, wander, *nothing), hypotheses, first.members)
-    p = np.array([float(tail(first.null[:, m], worth[m])) for m in range(len(first.members))])
+    nothing = NullDays(np.zeros((0, evidence.products.shape[1])), np.zeros((0, len(wander.shapes[0]))))
+    gain, worth, found, _ = _looked(PairSolver(evidence, hypotheses, wander, nothing), hypotheses, first.members)
+    p = np.array([float(tail(first.null[:, m], worth[m], CHI_SQUARED)) for m in range(len(first.members))])
     return replace(first, gain=gain, worth=worth, q=found, p=p)
 
 
 def _looked(
-    bench: Bench, hypotheses: Sequence[Hypothesis], members: Sequence[tuple[int, int]]
+    bench: PairSolver, hypotheses: Sequence[Hypothesis], members: Sequence[tuple[int, int]]
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...], np.ndarray]:
     """Gain (M,), worth (M,) and coordinates of pairs at the levels of their highest worth; worth (N, M) on nulls."""
     placed: list[list[int]] = [[] for _ in hypotheses]

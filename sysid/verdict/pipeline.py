@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from sysid import command_line
+from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log
-from sysid.missing.catalogue import PARAMETER, base_values
-from sysid.missing.days import Reference
-from sysid.missing.drives import make_drives
+from sysid.missing.catalogue import PARAMETER
+from sysid.missing.days import Reference, Wander
+from sysid.missing.evidence import Evidence
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
@@ -28,7 +29,7 @@ from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
-from sysid.verdict.result import LoopConfig, Prepared, Result, Stood
+from sysid.verdict.result import LoopConfig, Prepared, Result, Support
 from sysid.verdict.rounds import Asked, begin
 from sysid.verdict.search import pairs_of, settle
 from sysid.verdict.sensor_noise import compared, with_noise
@@ -36,15 +37,15 @@ from sysid.verdict.sensor_noise import compared, with_noise
 
 def find_missing(
     log: Log, references: Sequence[Log] = (), config: LoopConfig | None = None, vehicle: Any = None,
-    progress: Progress | None = None, reference: Reference | Prepared | None = None, start: Any = None,
+    progress: Progress | None = None, reference: Reference | Prepared | None = None,
 ) -> Result:
     """Verdict on the training trials of a log; its held-out trials are not looked at.
 
     Args:
         log: the drives in question.
         references: drives of the same vehicle on other days.
-        vehicle: `VehicleParams` fitted before, kept as the reference; or `FittedVehicle`, with what its fit knows.
-        start: `VehicleParams` where the fit of the base model starts, instead of the preset.
+        vehicle: `VehicleParams` fitted before, kept as the reference; or `FittedVehicle`, with what its fit knows, or
+            from which the fit of the base model starts.
         reference: a reference made before, for many logs of one vehicle; `prepare` also saves compiling again.
     """
     config = config or LoopConfig()
@@ -53,65 +54,84 @@ def find_missing(
         config = replace(config, pose_delay=True)
     began = time.perf_counter()
     if reference is None:
-        reference = reference_for(log, references, config, vehicle, progress, start)
+        reference = reference_for(log, references, config, vehicle, progress)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
-    ready = ready.without(config.without)
-    reference, found, full, names = ready.reference, ready.hypotheses, ready.full, ready.names
     fitted = time.perf_counter()
-    base = base_values(full)
-    drives = make_drives(ready.plant, full, names, log.training, reference.width, ready.paths, reference.gyro)
-    at = drives.simulate(np.array([base[name] for name in names])[None])[0]
-    drives = drives.weighted(at, reference.factors, log.spec.track)
-    noise = compared(drives, at, reference, config.thresholds.alpha)
-    usual, ready = ready, with_noise(ready, noise)
-    reference = ready.reference
-    evidence, slopes = gather(drives, reference, found, full, progress)
+    seen = _look(log, ready.without(config.without), config, progress)
     gathered = time.perf_counter()
-    refitter = Refitter(drives, reference, np.array([base[name] for name in names]), slopes)
-    draws = min(config.draws, 300) if config.quick else config.draws
-
-    def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
-
-    asked = begin(evidence, found, refitter, ready.wander, config.thresholds, anything, draws, config.seed, progress)
+    asked, reference = _asked(log, seen, config, progress), seen.ready.reference
     alone = stands_alone(log.training, reference.known)
     judge: Callable[[Asked, PairScan | None], Search] = settle
     if alone:
         judge = partial(search_alone, wheels=any(trial.odometry is not None for trial in log.training))
     pairs = None if alone else pairs_of(asked, config.seed)
     outcome = judge(asked, pairs)
-    if outcome.findings is not None and noise is not None:
-        other = tuple(name for name, one in noise.report().items() if one["changed"])
+    if outcome.findings is not None and seen.noise is not None:
+        other = tuple(name for name, one in seen.noise.report().items() if one["changed"])
         outcome = outcome.judged(replace(outcome.findings, noise=other), config.thresholds)
     searched, nulls = time.perf_counter(), None
     if config.refit_nulls:
-        nulls = run_null_refits(replace(asked, wander=usual.wander), judge, pairs, config.refit_nulls,
-                                config.seed, progress)
-        outcome = checked(outcome, nulls, ready.wander, config.thresholds)
-    stood: tuple[Stood, ...] = ()
+        usual = replace(asked, wander=seen.usual)
+        nulls = run_null_refits(usual, judge, pairs, config.refit_nulls, config.seed, progress)
+        outcome = checked(outcome, nulls, seen.ready.wander, config.thresholds)
+    stood: tuple[Support, ...] = ()
     if outcome.verdict == "named":
         # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
-        p_excess = (lambda _: 1.0) if alone else usual.wander.p_excess
-        stood = tuple(stand(outcome, refitter, log.training, evidence.groups, log.spec.track, p_excess))
+        p_excess = (lambda _: 1.0) if alone else seen.usual.p_excess
+        stood = tuple(stand(outcome, seen.refitter, log.training, seen.evidence.groups, log.spec.track, p_excess))
         outcome = guarded(outcome, stood, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
     floor = floor_change(reference, log.training, config.thresholds.alpha)
-    result = Result(log, tuple(references), config, ready, outcome, evidence, seconds, nulls, stood, noise, floor)
+    result = Result(log, tuple(references), config, seen.ready, outcome, seen.evidence, seconds, nulls, stood,
+                    seen.noise, floor)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What some drives show, before anything is searched for in them."""
+
+    ready: Prepared
+    """Where their noise is another one, with that noise."""
+    usual: Wander
+    """At the noise of the reference days."""
+    noise: NoiseLevels | None
+    evidence: Evidence
+    refitter: Refitter
+
+
+def _look(log: Log, ready: Prepared, config: LoopConfig, progress: Progress | None) -> Seen:
+    """Noise and signatures of the training trials."""
+    drives, at = ready.drives(log.training, log.spec.track)
+    noise = compared(drives, at, ready.reference, config.thresholds.alpha)
+    usual, ready = ready.wander, with_noise(ready, noise)
+    evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
+    return Seen(ready, usual, noise, evidence, Refitter(drives, ready.reference, ready.values, slopes))
+
+
+def _asked(log: Log, seen: Seen, config: LoopConfig, progress: Progress | None) -> Asked:
+    """What is searched for in the drives."""
+    reference = seen.ready.reference
+
+    def anything(residual: np.ndarray) -> float:
+        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
+
+    return begin(seen.evidence, seen.ready, seen.refitter, config, anything, progress)
+
+
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
     """`find_missing` with a progress bar. With references, `vehicle` is where the fit to them starts."""
-    start = None if vehicle is None or not references else vehicle.params
-    kept = vehicle if start is None else None
+    if vehicle is not None:
+        vehicle = replace(vehicle, kept=not references)
+    kept = vehicle is not None and vehicle.kept
     progress, close = command_line.progress_bar(
-        expected_steps(config, len(days_of(references)), kept is not None), "close the loop", "step")
+        expected_steps(config, len(days_of(references)), kept), "close the loop")
     progress(0, "reference vehicle")
     try:
-        return find_missing(log, references, config, kept, progress, start=start)
+        return find_missing(log, references, config, vehicle, progress)
     finally:
         close()
 

@@ -7,15 +7,14 @@ a saved file can be judged again, with other priors too (`python -m sysid.verdic
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from whill_mjx.io.fields import shown
+from whill_mjx.io.fields import record, shown
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.formats import FORMATS, stamp, upgraded
 from whill_mjx.io.reading import read_json
@@ -23,8 +22,6 @@ from whill_mjx.io.reading import read_json
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
 KIND = "sysid-evidence"
 AGAIN = "Give evidence.json of a run of sysid.close_loop."
-WORDS = ("effects", "variants", "classes", "against", "noise")
-"""Entries of a file that hold no numbers."""
 MOST = 2
 """Effects that are named together. A third one is only tried to see whether the first stood in for two."""
 
@@ -228,14 +225,19 @@ def _decide(findings: Findings, priors: Thresholds) -> tuple[str, int | None, fl
     share = 0.0 if one is None else findings.named(one, priors)
     if one is not None and share >= priors.share:
         if against := findings.against.get("+".join(one.effects), []):
-            return ("unexplained", chosen, share, f"{' and '.join(sorted(one.effects))} would explain {share:.0%} of "
-                    f"what can be explained, but {'; '.join(against)}")
+            return "unexplained", chosen, share, contradicted(one.effects, share, against)
         return "named", chosen, share, f"explains {share:.0%} of what can be explained"
     if not missing(findings.p_refit if one is None else one.p_value, p_excess, priors):
         return "none", None, 0.0, "what stands out has no name, and days with nothing missing differ by as much"
     after = findings.excess if one is None else one.left.excess
     return ("unexplained", chosen, share, f"the best of the catalogue explains {share:.0%} of what can be explained, "
             f"and {after:.0%} above the noise is left")
+
+
+def contradicted(effects: Iterable[str], share: float, against: Iterable[str]) -> str:
+    """Why effects are not named."""
+    return (f"{' and '.join(sorted(effects))} would explain {share:.0%} of what can be explained, but "
+            f"{'; '.join(against)}")
 
 
 def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
@@ -281,17 +283,22 @@ def as_json(findings: Findings) -> dict[str, Any]:
     return {**stamp(KIND), **asdict(findings)}
 
 
-def from_json(content: dict[str, Any]) -> Findings:
-    """The findings of a file."""
-    def left(one: dict[str, Any]) -> Left:
-        return Left(**one)
+def from_json(content: dict[str, Any], where: str = "findings") -> Findings:
+    """The findings of a file.
 
-    sets = tuple(
-        TriedSet(tuple(one["effects"]), tuple(one["variants"]), tuple(one["coordinates"]), one["gain"], tuple(one["p"]),
-                 one["p_value"], left(one["left"]), tuple(one["own"]), tuple(one["foretold"]), left(one["bent"]),
-                 tuple(tuple(each) for each in one["classes"])) for one in content["sets"])
-    known = {key: value for key, value in content.items() if key not in ("schema", "kind", "sets", "noise")}
-    return Findings(**known, sets=sets, noise=tuple(content["noise"]))
+    Raises:
+        ValueError: if there is a value of another kind, or a set whose lists are not of one length.
+    """
+    findings = record(where, Findings, {key: value for key, value in content.items() if key not in ("schema", "kind")})
+    for index, one in enumerate(findings.sets):
+        lengths = {len(each) for each in (one.effects, one.variants, one.p, one.own, one.foretold, one.classes)}
+        if len(lengths) != 1 or 0 in lengths or not all(one.classes):
+            raise ValueError(f"{where}: sets[{index}]: effects, variants, p, own, foretold and classes must be of one "
+                             "length, above 0.")
+    for name in ("day", "count", "freedom"):
+        if getattr(findings, name) <= 0:
+            raise ValueError(f"{where}: {name} = {shown(getattr(findings, name))} must be above 0.")
+    return findings
 
 
 def read(path: Path) -> Findings:
@@ -304,29 +311,7 @@ def read(path: Path) -> Findings:
     if content.get("kind") != KIND or content.get("schema") != FORMATS[KIND].schema:
         raise ValueError(f"{path}: kind {shown(content.get('kind'))}, schema {shown(content.get('schema'))}; this "
                          f"program reads {KIND!r}, schema {FORMATS[KIND].schema}. {AGAIN}")
-    try:
-        findings = from_json(content)
-    except (TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path}: no evidence of a verdict ({error}). {AGAIN}") from None
-    for name, value in _numbers(asdict(findings)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ValueError(f"{path}: {name} = {shown(value)} is not a finite number. {AGAIN}")
-        if name in ("day", "count", "freedom") and value <= 0:
-            raise ValueError(f"{path}: {name} = {shown(value)} must be above 0. {AGAIN}")
-    return findings
-
-
-def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Name and value of all that must be a number: what is neither a word, None, nor a list or table of such."""
-    if isinstance(content, dict):
-        for key, value in content.items():
-            if key not in WORDS:
-                yield from _numbers(value, key)
-    elif isinstance(content, list | tuple):
-        for value in content:
-            yield from _numbers(value, name)
-    elif content is not None or name != "p_pairs":
-        yield name, content
+    return from_json(content, str(path))
 
 
 def write(path: Path, findings: Findings) -> None:

@@ -19,7 +19,7 @@ from sysid.missing.reference import BLOCK, make_reference, of_vehicle
 from sysid.missing.signatures import PARTS
 from sysid.missing.wander import estimate
 from sysid.replay.models import gyro_effects, with_effects
-from sysid.replay.records import Plant
+from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.search.result import Progress
 from sysid.verdict.found import EFFORT
@@ -46,8 +46,8 @@ def prepare(
     full = with_catalogue(reference.params, found)
     base = base_values(full)
     paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), rows_of_call())
-    drives = make_drives(plant, full, tuple(base), tuple(one.trial for one in reference.leftovers), reference.width,
-                         paths, reference.gyro)
+    drives = make_drives(FreeVehicle(plant, full, tuple(base)), tuple(one.trial for one in reference.leftovers),
+                         reference.width, paths, reference.gyro)
     drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
     wander = estimate(drives, reference, found, full, spec, progress)
     return Prepared(reference, plant, found, full, tuple(base), paths, wander)
@@ -65,8 +65,7 @@ def _plant(spec: VehicleSpec, config: LoopConfig) -> Plant:
 
 def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     """How far the progress bar goes at most, with so many reference days."""
-    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
-    base = 0 if fitted else iterations + max(iterations // 2, 3)
+    base = 0 if fitted else config.base_iterations + max(config.base_iterations // 2, 3)
     return base + 6 * days + 2 * PARTS + 4 + 3 * (2 * EFFORT.rounds + 1) + config.refit_nulls
 
 
@@ -86,26 +85,24 @@ def days_of(references: Sequence[Log]) -> tuple[Log, ...]:
 
 
 def reference_for(
-    log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None, progress: Progress | None = None,
-    start: Any = None,
+    log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None, progress: Progress | None = None
 ) -> Reference:
     """The vehicle as its reference drives or its file show it; of the log itself where there is neither.
 
     Args:
-        vehicle: `VehicleParams` or `FittedVehicle`, kept as it is.
+        vehicle: `VehicleParams`, kept as they are, or `FittedVehicle`.
     """
     plant = _plant(log.spec, config)
-    if vehicle is not None:
-        fitted = vehicle if isinstance(vehicle, FittedVehicle) else FittedVehicle(vehicle)
+    fitted = vehicle if isinstance(vehicle, FittedVehicle | None) else FittedVehicle(vehicle)
+    if fitted is not None and fitted.kept:
         shown = [trial for one in references or (log,) for trial in one.training]
         fitted = replace(fitted, params=with_effects(fitted.params, gyro_effects(shown)))
         free = _free(fitted.params, config)
         if not references:
             return of_vehicle(plant, fitted, log, free, progress)
-        return make_reference(plant, fitted.params, days_of(references), True, 0, free, progress, True)
-    start = preset_params(log.spec, config.preset) if start is None else start
+        return make_reference(FreeVehicle(plant, fitted.params, tuple(free)), days_of(references), True, 0, progress)
+    start = preset_params(log.spec, config.preset) if fitted is None else fitted.params
     start = with_effects(start, (*config.with_effects, *gyro_effects(
         [trial for one in references or (log,) for trial in one.training])))
-    iterations = max(config.iterations // 2, 4) if config.quick else config.iterations
-    return make_reference(plant, start, days_of(references) or (log,), bool(references), iterations,
-                          _free(start, config), progress)
+    return make_reference(FreeVehicle(plant, start, tuple(_free(start, config))), days_of(references) or (log,),
+                          bool(references), config.base_iterations, progress)

@@ -11,11 +11,12 @@ import numpy as np
 
 from sysid.errors.noise_level import NoiseLevels
 from sysid.logs.floor import FloorChange
-from sysid.logs.records import Log
-from sysid.missing.catalogue import Hypothesis
+from sysid.logs.records import Log, Trial
+from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.days import Reference, Wander
+from sysid.missing.drives import Drives, make_drives
 from sysid.missing.evidence import Evidence, column_layout
-from sysid.replay.records import Plant
+from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay
 from sysid.verdict.agreement import Heterogeneity
 from sysid.verdict.falsifiers import Tested, in_words
@@ -25,7 +26,7 @@ from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
 
 @dataclass(frozen=True)
-class Stood:
+class Support:
     """What speaks for one effect of a joint fit, and against it."""
 
     effect: str
@@ -82,6 +83,16 @@ class LoopConfig:
     thresholds: Thresholds = field(default_factory=Thresholds)
     """When something counts as found."""
 
+    @property
+    def nulls(self) -> int:
+        """Simulated nulls, fewer where it must be quick."""
+        return min(self.draws, 300) if self.quick else self.draws
+
+    @property
+    def base_iterations(self) -> int:
+        """Iterations of the base fit, fewer where it must be quick."""
+        return max(self.iterations // 2, 4) if self.quick else self.iterations
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -97,6 +108,25 @@ class Prepared:
     wander: Wander
     others: dict[Any, PathReplay] = field(default_factory=dict)
     """Compiled replays of vehicles with effects that the catalogue does not have, by plant and structure."""
+
+    @property
+    def vehicle(self) -> FreeVehicle:
+        """With every parameter free that has an effect in the catalogue or in the base model."""
+        return FreeVehicle(self.plant, self.full, self.names)
+
+    @property
+    def values(self) -> np.ndarray:
+        """(all,) of these parameters."""
+        base = base_values(self.full)
+        return np.array([base[name] for name in self.names])
+
+    def drives(self, trials: tuple[Trial, ...], track: float) -> tuple[Drives, np.ndarray]:
+        """Drives of trials, weighted by the noise that their motion has, and their features (B, K, C) without any
+        effect."""
+        reference = self.reference
+        drives = make_drives(self.vehicle, trials, reference.width, self.paths, reference.gyro)
+        at = drives.simulate(self.values[None])[0]
+        return drives.weighted(at, reference.factors, track), at
 
     def without(self, effects: Sequence[str]) -> Prepared:
         """The same without some effects of the catalogue; nothing is compiled or simulated again."""
@@ -121,7 +151,7 @@ class Result:
     evidence: Evidence
     seconds: dict[str, float]
     null_refits: NullRefits | None = None
-    stood: tuple[Stood, ...] = ()
+    stood: tuple[Support, ...] = ()
     """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
     noise: NoiseLevels | None = None
     """Noise of each channel over that of the reference days; None without such days."""

@@ -18,11 +18,18 @@ from sysid.verdict.agreement import beside, foretold
 from sysid.verdict.classes import imitation
 from sysid.verdict.found import EFFORT, Candidate, PairScan, Scan, Search
 from sysid.verdict.posterior import Thresholds
+from sysid.verdict.result import LoopConfig, Prepared
 from sysid.verdict.scan import best, run
 
-FIRST_LOOK, POLISH = 4, 8  # iterations of a refit for every candidate, and more for the best
+FIRST_LOOK, POLISH, TO_ITS_END = 4, 8, 60
+"""Iterations at most of a refit for every candidate, of one that starts again, and of what is compared or built on.
+
+Fits end by themselves long before the last number where the base lies near the reference. Of drives that stand alone
+the base may go far: cut short, the next effect would be credited with what the fit before it had not yet found."""
 ELSEWHERE = (1.0, 3.0)
 """Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
+NEARER = (0.3, 0.1, 0.03)
+"""Shares of an effect's coordinates from which a fit starts where the whole of them fit no better than none."""
 SIDE = 2.0
 """Coordinate from which such a fit starts on either side of what only changes the effect."""
 Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
@@ -71,23 +78,24 @@ class Asked:
 
 
 def begin(
-    evidence: Evidence, hypotheses: Sequence[Hypothesis], refitter: Refitter, wander: Wander, thresholds: Thresholds,
-    anything: Callable[[np.ndarray], float] = lambda _: 0.0, draws: int = 1000, seed: int = 0,
-    progress: Progress | None = None,
+    evidence: Evidence, ready: Prepared, refitter: Refitter, config: LoopConfig,
+    anything: Callable[[np.ndarray], float] = lambda _: 0.0, progress: Progress | None = None,
 ) -> Asked:
-    """What a search asks, around the base refitted to the drives."""
+    """What a search asks about a prepared vehicle, around the base refitted to the drives; `anything` as of `Asked`."""
+    hypotheses, wander = ready.hypotheses, ready.wander
+
     def report(text: str) -> None:
         if progress is not None:
             progress(1, text)
 
-    base = refitter.fit((), np.zeros(0))
+    base = refitter.fit((), np.zeros(0), TO_ITS_END)
     report("base refit")
     far = best(Solver(evidence), hypotheses, wander)
     evidence = at_fit(evidence, base.residual, base.jacobian, base.u - refitter.reference.u)
-    scan = run(evidence, hypotheses, refitter.reference.spread, wander, draws, seed)
+    scan = run(evidence, hypotheses, refitter.reference.spread, wander, config.nulls, config.seed)
     report("scan")
-    return Asked(evidence, hypotheses, refitter, wander, thresholds, base, scan, imitation(evidence, hypotheses),
-                 anything, report, far)
+    return Asked(evidence, hypotheses, refitter, wander, config.thresholds, base, scan,
+                 imitation(evidence, hypotheses), anything, report, far)
 
 
 def candidates_of(asked: Asked, found: Search, current: Refit) -> list[Candidate]:
@@ -109,23 +117,37 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
     def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
         return [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes) for h, q in listed]
 
-    fits = refitter.fit_all(starts(chosen), FIRST_LOOK)
+    fits = refitter.fit_all(nearer(refitter, starts(chosen), current), FIRST_LOOK)
     asked.report(f"refits, round {number}")
     least = current.cost - asked.thresholds.form * max((current.cost - fit.cost for fit in fits), default=0.0)
     best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
-    for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], POLISH), strict=True):
+    for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], TO_ITS_END), strict=True):
         fits[i] = fit
     for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
-        again = refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH)
-        fits[i] = min([fits[i], *again], key=lambda fit: fit.cost)
+        again = min(refitter.fit_all(elsewhere(refitter, fits[i], len(current.q)), FIRST_LOOK + POLISH),
+                    key=lambda fit: fit.cost)
+        if again.cost < fits[i].cost:
+            [fits[i]] = refitter.fit_all([Start.at(again)], TO_ITS_END)
     asked.report(f"polish, round {number}")
     similar = np.where(asked.similar > asked.thresholds.form, asked.similar, 0.0)
     rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
-    fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
+    fits += refitter.fit_all(nearer(refitter, starts(chosen[len(fits) :]), current), POLISH)
     asked.report(f"rivals, round {number}")
     candidates = [candidate_of(asked, h, fit, current) for (h, _), fit in zip(chosen, fits, strict=True)]
     return sorted(candidates, key=lambda one: -one.gain)
+
+
+def nearer(refitter: Refitter, starts: Sequence[Start], current: Refit) -> list[Start]:
+    """Starts of joint fits with one more effect than `current`. Where the drives fit no better with it, its coordinates
+    are shortened to where they fit best: a linear scan says little of the way to a large effect, and a fit that starts
+    beyond a ridge would look as if there were nothing to gain."""
+    out = list(starts)
+    for i in np.flatnonzero(refitter.costs(out) >= current.cost):
+        q, size = out[i].q, len(current.q)
+        ways = [replace(out[i], q=np.append(q[:size], share * q[size:])) for share in (1.0, *NEARER)]
+        out[i] = ways[int(np.argmin(refitter.costs(ways)))]
+    return out
 
 
 def rescan(asked: Asked, current: Refit) -> Looked:

@@ -25,7 +25,7 @@ SPREAD_FREEDOM = 8  # degrees of freedom that the day-to-day spread rests on
 
 
 @dataclass(frozen=True)
-class Found:
+class ScanPoint:
     """One hypothesis at one level; leading axes are those of the moments."""
 
     gain: np.ndarray  # (...,)
@@ -36,7 +36,7 @@ class Found:
 def look(
     solver: Solver, columns: Columns, axes: Sequence[Axis], wander: np.ndarray, moments: np.ndarray | None = None,
     away: np.ndarray | float = 0.0,
-) -> Found:
+) -> ScanPoint:
     """Fit of one hypothesis at one level; axes that would go below 0 where only more is possible are left out.
 
     Args:
@@ -63,17 +63,17 @@ def look(
             row = np.zeros_like(q)
             row[..., position] = alone.q[..., 0]
             q = np.where(better[..., None], row, q)
-        found = Found(gain, worth, q)
+        found = ScanPoint(gain, worth, q)
     kept = _kept(found.q, upper)
-    return Found(found.gain * kept, found.worth * kept, found.q)
+    return ScanPoint(found.gain * kept, found.worth * kept, found.q)
 
 
 def _fit(solver: Solver, index: Sequence[int], wander: np.ndarray, moments: np.ndarray | None,
-         away: np.ndarray | float) -> Found:
+         away: np.ndarray | float) -> ScanPoint:
     information = solver.information(index)
     q = np.linalg.solve(information, solver.score(index, moments)[..., None])[..., 0] + away
     whole = np.linalg.inv(np.linalg.inv(information) + wander)
-    return Found(np.einsum("...i,ij,...j->...", q, information, q), np.einsum("...i,ij,...j->...", q, whole, q), q)
+    return ScanPoint(np.einsum("...i,ij,...j->...", q, information, q), np.einsum("...i,ij,...j->...", q, whole, q), q)
 
 
 def _kept(q: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -86,13 +86,14 @@ def best(
     solver: Solver, hypotheses: Sequence[Hypothesis], wander: Wander
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """Gain (H,), worth (H,) and coordinates of each hypothesis at the level of its highest worth."""
-    top: list[Found | None] = [None] * len(hypotheses)
+    top: list[ScanPoint | None] = [None] * len(hypotheses)
     for columns, covariance in zip(solver.evidence.columns, wander.covariance, strict=True):
         found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance)
         so_far = top[columns.hypothesis]
         if so_far is None or found.worth > so_far.worth:
             top[columns.hypothesis] = found
-    chosen = [one or Found(np.zeros(()), np.zeros(()), np.zeros(len(hypotheses[h].axes))) for h, one in enumerate(top)]
+    chosen = [one or ScanPoint(np.zeros(()), np.zeros(()), np.zeros(len(hypotheses[h].axes)))
+              for h, one in enumerate(top)]
     return (np.array([float(one.gain) for one in chosen]), np.array([float(one.worth) for one in chosen]),
             tuple(one.q for one in chosen))
 
@@ -105,22 +106,30 @@ def run(
     rng = np.random.default_rng(seed)
     solver = Solver(evidence)
     gain, worth, q = best(solver, hypotheses, wander)
-    moments = null_moments(evidence, spread, draws, rng)
-    share = wander.draw_shares(draws, rng)
+    days = null_days(evidence, spread, wander, draws, rng)
     null = np.zeros((draws, len(hypotheses)))
     for number, (columns, covariance) in enumerate(zip(evidence.columns, wander.covariance, strict=True)):
-        away = wander.away(number, share)
-        found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance, moments, away)
+        away = wander.away(number, days.share)
+        found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance, days.moments, away)
         null[:, columns.hypothesis] = np.maximum(null[:, columns.hypothesis], found.worth)
     p = np.array([tail(null[:, h], worth[h]) for h in range(len(hypotheses))])
     each = np.stack([tail(null[:, h], null[:, h]) for h in range(len(hypotheses))], axis=-1)
     return Scan(gain, worth, q, null, p, each.min(1))
 
 
-def null_moments(
-    evidence: Evidence, spread: np.ndarray, draws: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Moments (N, P + S) of simulated drives in which nothing is missing."""
+@dataclass(frozen=True)
+class NullDays:
+    """Simulated days on which nothing is missing."""
+
+    moments: np.ndarray  # (N, P + S)
+    share: np.ndarray  # (N, D) of the reference days' apparent effects in each
+
+
+def null_days(
+    evidence: Evidence, spread: np.ndarray, wander: Wander, draws: int, rng: np.random.Generator
+) -> NullDays:
+    """Draw days with the noise and commands of some drives; `spread` (P, P) is the day-to-day covariance of the base
+    parameters."""
     size = evidence.base_size
     factor = np.linalg.cholesky(spread + 1e-14 * np.eye(size))
     products = evidence.products.sum(0)[:, :size]
@@ -129,7 +138,7 @@ def null_moments(
         moments[n] = products @ drawn_away(factor, rng)
         for group in evidence.groups:
             moments[n] += drawn_noise([evidence.pool_moments[trial] for trial in group], evidence.shared, rng)
-    return moments
+    return NullDays(moments, wander.draw_shares(draws, rng))
 
 
 def drawn_noise(pools: Sequence[np.ndarray], shared: float, rng: np.random.Generator) -> np.ndarray:

@@ -12,10 +12,10 @@ from sysid.missing.joint_fit import Start, moved_last
 from sysid.verdict.agreement import interval_of_sum
 from sysid.verdict.forms import forms_of
 from sysid.verdict.found import EFFORT, LARGEST, Candidate, PairScan, Search
-from sysid.verdict.pairs import scan_pairs
+from sysid.verdict.pairs import DRAWS, scan_pairs
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
 from sysid.verdict.rounds import POLISH, Asked, candidates_of, class_of, p_of_last, pair_round
-from sysid.verdict.scan import best
+from sysid.verdict.scan import best, null_days
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,9 @@ class Weighed:
 
 def pairs_of(asked: Asked, seed: int = 0) -> PairScan:
     """A scan of all pairs of effects beside the base."""
-    pairs = scan_pairs(asked.evidence, asked.hypotheses, asked.refitter.reference.spread, asked.wander, asked.similar,
-                       asked.thresholds.same, seed=seed)
+    nulls = null_days(asked.evidence, asked.refitter.reference.spread, asked.wander, DRAWS,
+                      np.random.default_rng((seed, 2)))
+    pairs = scan_pairs(asked.evidence, asked.hypotheses, asked.wander, nulls, asked.similar, asked.thresholds.same)
     asked.report("scan of pairs")
     return pairs
 

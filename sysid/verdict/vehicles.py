@@ -17,7 +17,9 @@ from sysid.missing.pose_fit import fit_poses
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import base_columns
 from sysid.replay.models import measured_effects, with_effects
+from sysid.replay.records import FreeVehicle
 from sysid.verdict.result import Result
+from whill_mjx.effects import EFFECTS, make_effects
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 
 
@@ -90,7 +92,7 @@ def _to_poses(result: Result, vehicle: Any, names: list[str], iterations: int) -
     inside = np.array(known) >= 0
     spread = np.where(np.outer(inside, inside), reference.spread[np.ix_(known, known)], 0.0)
     drives, held = drives_of(result, trials, vehicle)
-    u = fit_poses(drives, trials, space, held, spread, iterations)
+    u = fit_poses(drives, space, held, spread, iterations)
     return vehicle if u is None else set_values(
         vehicle, space.names, jnp.asarray(space.to_values(u), jnp.result_type(float)))
 
@@ -98,28 +100,38 @@ def _to_poses(result: Result, vehicle: Any, names: list[str], iterations: int) -
 def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[Drives, np.ndarray]:
     """Trials as a vehicle replays them, and the values (all,) of its parameters there.
 
-    They go through what was compiled for the search, where the catalogue has all effects of the vehicle; those that the
-    vehicle does not have are neutral.
+    They go through what was compiled for the search, where the catalogue has all effects of the vehicle, or else
+    through one replay for all vehicles of a result; effects that this vehicle does not have are neutral.
     """
     ready, width, values = result.prepared, result.reference.width, base_values(vehicle)
     gyro = result.reference.gyro
     if set(values) <= set(ready.names):
         values = {**base_values(ready.full), **values}
-        drives = make_drives(ready.plant, ready.full, ready.names, trials, width, ready.paths, gyro)
+        drives = make_drives(ready.vehicle, trials, width, ready.paths, gyro)
         return drives, np.array([values[name] for name in ready.names])
-    kind = ready.plant, jax.tree.structure(vehicle)
-    drives = make_drives(ready.plant, vehicle, tuple(values), trials, width, ready.others.get(kind), gyro)
+    vehicle = _with_named(result, vehicle)
+    values, kind = base_values(vehicle), (ready.plant, jax.tree.structure(vehicle))
+    drives = make_drives(FreeVehicle(ready.plant, vehicle, tuple(values)), trials, width, ready.others.get(kind), gyro)
     ready.others[kind] = drives.paths
     return drives, np.array(list(values.values()))
 
 
+def _with_named(result: Result, vehicle: Any) -> Any:
+    """The vehicle with the named effects, neutral where it had none, in one order for all vehicles of a result."""
+    have = {effect.name: effect for effect in vehicle.effects}
+    named = result.search.final.hypotheses if result.search.verdict == "named" else ()
+    names = [*have, *(axis.parameter.partition(".")[0] for one in named for axis in one.axes)]
+    first = [effect.name for effect in result.reference.params.effects]
+    later = make_effects(name for name in names if name in EFFECTS and name not in first)
+    order = dict.fromkeys([*first, *(effect.name for effect in later), *have])
+    every = {effect.name: effect for effect in later} | have
+    return type(vehicle)(vehicle.body, tuple(every[name] for name in order if name in every))
+
+
 def refitter_of(result: Result) -> Refitter:
     """A refitter like that of the search, through the replay that it compiled."""
-    base = base_values(result.full)
-    values = np.array([base[name] for name in result.names])
-    drives = make_drives(result.plant, result.full, result.names, result.log.training, result.reference.width,
-                         result.prepared.paths, result.reference.gyro)
-    drives = drives.weighted(drives.simulate(values[None])[0], result.reference.factors, result.log.spec.track)
+    values = result.prepared.values
+    drives, _ = result.prepared.drives(result.log.training, result.log.spec.track)
     return Refitter(drives, result.reference, values, base_columns(drives, result.reference, values, result.names))
 
 

@@ -23,7 +23,7 @@ from benchmarks.fit_jobs import (
 from benchmarks.fit_settings import Benchmark
 from benchmarks.plant.chair import VEHICLES, Chair
 from sysid.errors.space import Space, make_space, searched
-from sysid.intervals.independence import Evidence
+from sysid.intervals.independence import Information
 from sysid.replay.models import measured_effects, with_effects
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import WHILL_CR, in_proportion
@@ -79,7 +79,7 @@ def test_intervals_of_a_kept_search_are_made_anew(tmp_path):
     space = Space(("a", "b"), np.zeros(2), np.array([1.0, 10.0]), np.array([0.5, 2.0]), np.zeros(2, bool))
     blocks = np.tile(1e3 * np.eye(2), (12, 8, 1, 1))
     scores = 1e3**0.5 * random.standard_normal((12, 8, 2))
-    evidence = Evidence(np.array([0.4, 0.3]), scores - scores.mean((0, 1)), blocks, np.arange(12) // 2, 1.0, 1.0,
+    evidence = Information(np.array([0.4, 0.3]), scores - scores.mean((0, 1)), blocks, np.arange(12) // 2, 1.0, 1.0,
                         np.eye(2), 1.0)
     found = {"label": "synthetic_000", "parameters": {"b": row(3.1, 0.0, 9.0)}, "seconds": 1.0}
     with pytest.raises(ValueError, match="synthetic_000.*run the job again"):

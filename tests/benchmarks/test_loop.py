@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from benchmarks import loop_figures
+from benchmarks import loop, loop_figures
 from benchmarks.loop import Options, main
 from benchmarks.loop_figures import removed, summary
 from benchmarks.loop_page import write_page
@@ -66,6 +66,30 @@ def test_the_page_shows_the_verdict_the_truth_and_both_errors(tmp_path):
     page = write_page(out, out / "loop", summary(out)).read_text()
     for word in ("gain_fade, size 0.5", "supply_sag", "0.2", "0.05", "75 %", "the first verdict"):
         assert word in page
+
+
+def test_a_proposed_manoeuvre_is_driven_on_the_reference_days_too_and_the_second_verdict_gets_them(
+        tmp_path, monkeypatch):
+    """What a vehicle shows in a new manoeuvre is its model's form error too: without references that is an effect."""
+    out, closed = tmp_path / "run", []
+    main(Options(out, direct=True, until="days", **TINY))
+    (out / "stages" / "fit.json").write_text(json.dumps({"what": "", "seconds": 0.0}))
+    main(Options(out, direct=True, until="drives", **TINY))
+    proposal = {"name": "prbs", "replicates": 2, "splits": ["slope", "wind"], "start": {"x": 0, "y": 0, "heading": 0}}
+    report = {**verdict("slope", ["slope", "wind"], 0.2, 0.1, 0.0), "next_manoeuvre": proposal}
+    (out / "loop").mkdir()
+    (out / "loop" / "report.json").write_text(json.dumps(report))
+    (out / "loop" / "next_command.csv").write_text("t,v,omega\n0,0.3,0.2\n0.5,-0.3,0\n1,0,0\n")
+    monkeypatch.setattr(loop.Loop, "command", lambda self, stage, *words: closed.append((stage, *words)))
+    (out / "loop_again").mkdir()
+    (out / "loop_again" / "report.json").write_text(json.dumps(report))
+    main(Options(out, direct=True, until="loop_again", **TINY))
+    driven = {name: sorted(trial.name for trial in (out / name / "trials").iterdir())
+              for name in ("drives", "drives_again", "day_1", "day_1_again")}
+    assert driven == {"drives": ["turn_1"], "drives_again": ["proposed_1", "proposed_2", "turn_1"],
+                      "day_1": ["turn_1"], "day_1_again": ["proposed_1", "turn_1"]}
+    (again,) = [words for stage, *words in closed if stage == "loop_again"]
+    assert again[1:4] == [out / "drives_again", "--reference", out / "day_1_again"]
 
 
 def test_a_stage_that_fails_is_named_with_what_to_do(tmp_path):

@@ -15,7 +15,7 @@ from benchmarks.plant.chair import COULOMB, SLOW, VEHICLES, Chair
 from benchmarks.plant.commands import nine
 from benchmarks.plant.compare import channels, read
 from benchmarks.plant.effects import EFFECTS, in_proportion
-from benchmarks.plant.make import HELD_OUT, make_log, plan
+from benchmarks.plant.make import HELD_OUT, Experiment, make_log, plan
 from benchmarks.plant.sensors import outside_pose
 from benchmarks.plant.trial import Noise, Plant
 
@@ -81,7 +81,7 @@ def test_outside_pose_has_the_declared_noise():
 def test_replicates_differ_at_the_declared_level_and_not_without_noise(tmp_path):
     spreads = []
     for noise in (1.0, 0.0):
-        make_log(tmp_path / f"n{noise}", seed=5, noise=noise, manoeuvres=["circle"])
+        make_log(tmp_path / f"n{noise}", Experiment(seed=5, noise=noise, manoeuvres=["circle"]))
         rows = np.stack([channels(trial) for trial in read(tmp_path / f"n{noise}").values()])
         spreads.append(np.sqrt(rows.var(axis=0, ddof=1).mean(axis=0)))
     v, omega, yaw = spreads[0][:3]
@@ -91,31 +91,33 @@ def test_replicates_differ_at_the_declared_level_and_not_without_noise(tmp_path)
 
 @pytest.mark.quick
 def test_days_differ_by_a_few_percent_and_the_nominal_chair_does_not():
-    days = [plan({}, seed, 1.0, True)[0].chair for seed in range(20)]
+    days = [plan(Experiment({}, seed, 1.0, True))[0].chair for seed in range(20)]
     gains, masses = np.array([day.kp for day in days]), np.array([day.mass for day in days])
     assert len(set(gains)) == 20 and 0.01 < np.std(gains) / 9.0 < 0.06 and np.abs(masses / 54.0 - 1).max() < 0.1
-    assert plan({}, 1, 1.0, False)[0].chair == plan({}, 2, 1.0, False)[0].chair == Chair()
+    assert plan(Experiment({}, 1, 1.0, False))[0].chair == plan(Experiment({}, 2, 1.0, False))[0].chair == Chair()
 
 
 def test_the_same_arguments_give_the_same_files_in_any_number_of_processes(tmp_path):
     first, second, third = (
-        make_log(tmp_path / name, {"wind": 8.0}, seed=4, manoeuvres=SHORT, replicates=2, processes=processes)
+        make_log(tmp_path / name, Experiment({"wind": 8.0}, seed=4, manoeuvres=SHORT, replicates=2),
+                 processes=processes)
         for name, processes in (("a", 1), ("b", 1), ("c", 2))
     )
-    other = make_log(tmp_path / "d", {"wind": 8.0}, seed=6, manoeuvres=SHORT, replicates=2)
+    other = make_log(tmp_path / "d", Experiment({"wind": 8.0}, seed=6, manoeuvres=SHORT, replicates=2))
     assert contents(first) == contents(second) == contents(third)
     assert contents(first) != contents(other)
 
 
 def test_size_zero_is_the_plain_chair(tmp_path):
-    plain = make_log(tmp_path / "plain", seed=4, manoeuvres=SHORT, replicates=1)
-    zero = make_log(tmp_path / "zero", dict.fromkeys(EFFECTS, 0.0), seed=4, manoeuvres=SHORT, replicates=1)
+    plain = make_log(tmp_path / "plain", Experiment(seed=4, manoeuvres=SHORT, replicates=1))
+    zero = make_log(tmp_path / "zero", Experiment(dict.fromkeys(EFFECTS, 0.0), seed=4, manoeuvres=SHORT, replicates=1))
     assert contents(plain) == contents(zero)
 
 
 def test_the_dataset_is_blind_and_the_answers_lie_outside(tmp_path):
     effects = {name: entry.base / 10 for name, entry in EFFECTS.items()}
-    out = make_log(tmp_path / "set", effects, seed=4, manoeuvres=SHORT, replicates=1, answers=tmp_path / "truth.json")
+    out = make_log(tmp_path / "set", Experiment(effects, seed=4, manoeuvres=SHORT, replicates=1),
+                   answers=tmp_path / "truth.json")
     text = " ".join([*contents(out), *(data.decode() for data in contents(out).values())])
     assert not [name for name in EFFECTS if name in text]
     assert not any(word in text for word in ("seed", "effect", "kp"))
@@ -124,7 +126,7 @@ def test_the_dataset_is_blind_and_the_answers_lie_outside(tmp_path):
 
 
 def test_all_nine_manoeuvres_have_the_form_of_the_dataset(tmp_path):
-    out = make_log(tmp_path / "set", seed=1, replicates=1, ground_truth=False)
+    out = make_log(tmp_path / "set", Experiment(seed=1, replicates=1), ground_truth=False)
     trials = read(out)
     assert sorted(trials) == sorted(f"{name}_1" for name in nine(1)) and len(trials) == 9
     for streams in trials.values():
@@ -149,7 +151,8 @@ def test_every_vehicle_follows_its_commands_and_leaves_room_to_its_drives(name):
 
 
 def test_a_dataset_of_another_vehicle_has_its_nominal_values_and_its_own_odometry(tmp_path):
-    out = make_log(tmp_path / "set", seed=1, noise=0.0, manoeuvres=["straight"], replicates=1, vehicle="robot")
+    out = make_log(tmp_path / "set", Experiment(seed=1, noise=0.0, manoeuvres=["straight"], replicates=1,
+                   vehicle="robot"))
     fields = (out / "dataset.toml").read_text()
     nominal = VEHICLES["robot"].nominal
     for name, value in (("wheel_radius", nominal.radius), ("track", nominal.track), ("wheelbase", nominal.wheelbase),
@@ -174,7 +177,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr("benchmarks.plant.make.write_text", fail)
     with pytest.raises(OSError, match="disk full"):
-        make_log(tmp_path / "set", manoeuvres=SHORT, replicates=1)
+        make_log(tmp_path / "set", Experiment(manoeuvres=SHORT, replicates=1))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -192,10 +195,9 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
     ],
 )
 def test_bad_arguments_are_named(tmp_path, arguments, message):
-    if "answers" in arguments:
-        arguments = {"answers": tmp_path / "set" / "truth.json"}
+    answers = tmp_path / "set" / "truth.json" if arguments.pop("answers", None) else None
     with pytest.raises(ValueError, match=message):
-        make_log(tmp_path / "set", **arguments)
+        make_log(tmp_path / "set", Experiment(**arguments), answers=answers)
     assert list(tmp_path.iterdir()) == []
 
 

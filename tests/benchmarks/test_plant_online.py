@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.plant.draw import draw_effect
 from benchmarks.plant.effects import EFFECTS
-from benchmarks.plant.make import drive_all, plan
+from benchmarks.plant.make import Experiment, drive_all, plan
 from benchmarks.plant.online import OnlinePlant
 
 TABLE = np.array([[0, 0, 0], [0.5, 0.6, 0.4], [1.5, 0.1, -0.5], [2.0, 0.7, 0.0], [3.0, 0, 0]])
@@ -29,7 +29,7 @@ def online(setting, table, until):
 @pytest.mark.parametrize("effects", [{}, {"command_delay": 0.3}, {"acceleration_limit": 0.8}, {"sensor_delay": 0.1},
                                      {"wind": 20.0}], ids=lambda effects: "".join(effects) or "plain")
 def test_a_drive_command_by_command_is_the_drive_of_the_whole_table(effects):
-    setting, jobs = plan(effects, 3, 0.0, True, {"steps": TABLE}, 1)
+    setting, jobs = plan(Experiment(effects, 3, 0.0, True, {"steps": TABLE}, 1))
     ((_, odometry, pose, *_),) = drive_all(setting, jobs)
     rows, poses = online(setting, TABLE, 3.0)
     count = min(len(rows), len(odometry))
@@ -39,7 +39,7 @@ def test_a_drive_command_by_command_is_the_drive_of_the_whole_table(effects):
 
 
 def test_a_vehicle_that_is_placed_anew_stands_at_its_start():
-    setting, _ = plan({}, 1, 1.0, True)
+    setting, _ = plan(Experiment({}, 1, 1.0, True))
     plant = OnlinePlant(setting)
     plant.command(0.0, 0.8, 0.0)
     plant.advance(500)

@@ -119,12 +119,31 @@ class Publisher:
         return True
 
 
+class SetJoystickLock:
+    Request = message("SetJoystickLock_Request", d0=int)
+
+
+class Client:
+    """A client whose service answers at once, while there is one."""
+
+    def __init__(self):
+        self.asked, self.ready = [], True
+
+    def service_is_ready(self):
+        return self.ready
+
+    def call_async(self, request):
+        self.asked.append(request.d0)
+        answer = types.SimpleNamespace(exception=lambda: None, result=lambda: types.SimpleNamespace(result=1))
+        return types.SimpleNamespace(add_done_callback=lambda callback: callback(answer))
+
+
 class Node:
     """Records what is created; `deliver` and `fire` stand for transport and time."""
 
     def __init__(self, name="node"):
         self.name, self.clock = name, Clock()
-        self.publishers, self.subscriptions, self.timers, self.logged = {}, [], [], []
+        self.publishers, self.subscriptions, self.timers, self.logged, self.clients = {}, [], [], [], {}
         self.topics = {}  # what the graph says: topic to type of a foreign reader
         self.fails_on_lost_events = True  # as rmw_fastrtps of Humble
 
@@ -155,6 +174,9 @@ class Node:
         if event_callbacks is not None and event_callbacks.message_lost and self.fails_on_lost_events:
             raise UnsupportedEventTypeError
         self.subscriptions.append((self.resolve_topic_name(topic), msg_type, callback))
+
+    def create_client(self, srv_type, srv_name, *, qos_profile=None, callback_group=None):
+        return self.clients.setdefault(self.resolve_topic_name(srv_name), Client())
 
     def create_timer(self, timer_period_sec, callback, callback_group=None, clock=None):
         self.timers.append((timer_period_sec, callback))
@@ -203,6 +225,7 @@ def install():
         "diagnostic_msgs": {}, "diagnostic_msgs.msg": {"DiagnosticArray": DiagnosticArray,
                                                        "DiagnosticStatus": DiagnosticStatus, "KeyValue": KeyValue},
         "whill_msgs": {}, "whill_msgs.msg": {"ModelCr2State": ModelCr2State},
+        "whill_msgs.srv": {"SetJoystickLock": SetJoystickLock},
         "geometry_msgs": {}, "geometry_msgs.msg": {"Twist": Twist, "TwistStamped": TwistStamped},
     }
     for name in [name for name in sys.modules if name.split(".")[0] in modules]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from bridge.policy import SensorInput
 from bridge.simulated import Frame, Grid
 
 
@@ -40,6 +41,22 @@ class PointRobot:
         return Frame(image, self.x, self.y, self.yaw, v, omega, reached_goal=reached, done=done, terminated=reached,
                      odometry=(self.x, self.y, self.yaw, v, omega),
                      ranges=np.array([max(4.0 - self.x, 0.0), 1.0, 10.0, 1.0]))
+
+
+class SensingRobot(PointRobot):
+    """Has a second camera and a lidar of the policy's own; it never reaches its goal, but may stop before."""
+
+    goal, longest = 100.0, 100_000
+    sensors = {"camera": SensorInput("camera", "camera", (64, 64, 3)), "rear": SensorInput("rear", "camera", (6, 8, 3)),
+               "lidar": SensorInput("lidar", "lidar", (4,), {"reach": 8.0}),
+               "odometry": SensorInput("odometry", "odometry", (5,))}
+
+    def _frame(self, v, omega):
+        frame = super()._frame(v, omega)
+        rear = np.full((6, 8, 3), 250, np.uint8)
+        rear[0, self.steps % 8] = self.steps % 100
+        lidar = np.array([8.0, 3.0 - self.x, 5.0, 8.0])
+        return replace(frame, sensed={"camera": frame.image, "rear": rear, "lidar": lidar})
 
 
 class CrashingRobot(PointRobot):

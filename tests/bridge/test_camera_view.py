@@ -1,11 +1,11 @@
 """What a policy sees of a camera whose lens is calibrated."""
 
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bridge.image import ImageError, area_resize
+from bridge.image import ImageError, RawImage, area_resize
+from bridge.policy import SensorInput
 from bridge.view import Calibration, Rectifier, read_calibration, view_of
 
 pytestmark = pytest.mark.quick
@@ -28,7 +28,7 @@ def ideal(height, width, fov=FOV):
 
 
 def contract(**camera):
-    return SimpleNamespace(height=64, width=64, camera=camera)
+    return SensorInput("image", "camera", (64, 64, 3), camera=camera)
 
 
 @pytest.mark.parametrize("size", [(64, 64), (320, 320), (640, 640)])
@@ -76,9 +76,10 @@ def test_the_view_is_chosen_by_the_options_and_what_cannot_be_served_is_refused(
     path.write_text(YAML)
     assert read_calibration(path).matrix == (300.0, 310.0, 321.0, 238.0)
     view = view_of(contract(fov_y=FOV), None, path)
-    assert view.raw(480, 640, "bgr8", 1920, bytes(480 * 1920)).shape == (64, 64, 3)
+    assert view.raw(RawImage(480, 640, "bgr8", 1920, bytes(480 * 1920))).shape == (64, 64, 3)
     for crop, about, message in [((0, 0, 9, 9), contract(fov_y=FOV), "--crop and --calibration"),
                                  (None, contract(), "does not state its camera's field of view"),
-                                 (None, contract(fov_y=2.6), "camera.yaml: the camera does not see")]:
+                                 (None, contract(fov_y=2.6), "camera.yaml: the camera does not see"),
+                                 ((0, 0, 9, 9), SensorInput("scan", "lidar", (36,)), "the policy reads none")]:
         with pytest.raises(ValueError, match=message):
             view_of(about, crop, path)

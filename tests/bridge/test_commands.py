@@ -44,6 +44,17 @@ def test_zero_of_another_node_is_noticed_but_the_guards_zeros_are_not_taken_for_
     assert not reports(ear, 9, 9) and reports(ear, 9) and not reports(ear, 9, 9, 9)
 
 
+def test_zero_of_the_guard_may_overtake_our_own_commands():
+    """They come from two nodes, so nothing orders them: on a busy computer ours were taken for a stranger's."""
+    ear = Ear()
+    reports(ear, 0)
+    for v in (0.3, 0.2, 0.0):
+        ear.sent(v, 0.0)
+    assert not ear.heard(0.0, 0.0)  # of the guard
+    assert not any(ear.heard(v, 0.0) for v in (0.3, 0.2, 0.0))
+    assert not reports(ear, 1, 1, 1, 1, 1)
+
+
 def test_zero_heard_before_the_guard_reports_it_is_the_guards_however_long_that_takes():
     ear = Ear()
     reports(ear, 0)

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from bridge.controller import Controller
+from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
 
 pytestmark = pytest.mark.quick
@@ -30,6 +32,18 @@ class ScriptedPolicy:
     resets: int = 0
     novelty: float = 0.0
 
+    @property
+    def commands(self):
+        return self.contract
+
+    @property
+    def sensors(self):
+        return {"image": self.pacer}
+
+    @property
+    def pacer(self):
+        return SensorInput("image", "camera", (self.contract.height, self.contract.width, 3))
+
     def reset(self):
         self.steps = 0
         self.resets += 1
@@ -52,8 +66,9 @@ class World:
         self.now += dt
         self.count += 1
         data = bytes([self.count % 200 + 20]) * 192
-        fields = dict(stamp=self.now, stamp_age=0.0, height=8, width=8, encoding="rgb8", step=24, data=data)
-        return self.controller.on_image(self.now, **{**fields, **changes})
+        fields = dict(stamp=self.now, stamp_age=0.0, height=8, width=8, encoding="rgb8", step=24, data=data) | changes
+        stamp, age = fields.pop("stamp"), fields.pop("stamp_age")
+        return self.controller.on_image(self.now, stamp, age, SimpleNamespace(**fields))
 
     def tick(self, dt):
         self.now += dt

@@ -9,6 +9,8 @@ import time
 
 import pytest
 
+from bridge.exits import Exit
+
 
 def column(path, name):
     with open(path, encoding="utf-8", newline="") as file:
@@ -99,7 +101,7 @@ def test_refused_policy_ends_the_node_with_an_error_before_it_joins_the_graph(gr
     if damage == "hash":
         (policy / "policy.onnx").write_bytes(b"x")
     graph.start("drive", policy if damage == "hash" else policy.with_name("nowhere"))
-    assert graph.wait("drive") == 2
+    assert graph.wait("drive") == Exit.FAULT
     assert ("SHA-256" if damage == "hash" else "does not exist") in graph.log("drive")
 
 

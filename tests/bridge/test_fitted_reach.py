@@ -43,13 +43,13 @@ def test_a_manoeuvre_that_one_of_the_possible_vehicles_may_leave_the_floor_with_
 
 def test_what_the_simulator_refuses_is_said_in_one_line(check):
     code, said = check("refused.toml", 4, 3)
-    assert code == 2 and said.splitlines()[-1].endswith("refused.toml: fake: refused.toml: is no vehicle file.")
+    assert code == 1 and said.splitlines()[-1].endswith("refused.toml: fake: refused.toml: is no vehicle file.")
 
 
 def test_a_computer_without_the_simulator_is_told_what_to_do(check, monkeypatch):
     monkeypatch.setattr(fitted_reach, "SIMULATOR", "no_such_simulator")
     code, said = check("sure.toml", 4, 3)
-    assert code == 2 and "not installed here" in said and "--check" in said
+    assert code == 1 and "not installed here" in said and "--check" in said
 
 
 def test_a_path_is_widened_by_the_vehicle_and_by_what_it_drives_on():

@@ -50,10 +50,13 @@ humble_stub.install()
 import numpy as np
 from bridge import commands, drive, guard, vehicle_node
 from bridge.controller import Controller
+from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
 
 class Policy:
-    contract = types.SimpleNamespace(height=8, width=8, rate_hz=200.0, action_repeat=1)
+    contract = commands = types.SimpleNamespace(rate_hz=200.0, action_repeat=1)
+    pacer = SensorInput("image", "camera", (8, 8, 3))
+    sensors = {"image": pacer}
     reset = lambda self: None
     step = lambda self, image: np.array([0.2, 0.1])
 
@@ -83,7 +86,8 @@ assert isinstance(drive.ros.make_executor(), humble_stub.SingleThreadedExecutor)
 sent = [getattr(message, "twist", message) for message in node.publishers["/whill/controller/cmd_vel"].sent]
 reports = [report.status[0].message for report in node.publishers["/diagnostics"].sent]
 assert any(report.startswith("driving") for report in reports), reports
-print(json.dumps([[message.linear.x, message.angular.z] for message in sent]))
+asked = [client.asked for client in node.clients.values()]
+print(json.dumps([[[message.linear.x, message.angular.z] for message in sent], asked]))
 """
 
 
@@ -127,11 +131,17 @@ def test_chair_node_publishes_odometry_and_names_a_slow_driver(tmp_path):
 
 
 def test_chair_whose_rider_moves_the_joystick_is_left_to_its_rider(tmp_path):
-    commands = json.loads(run(DRIVE, tmp_path, "--image-topic", "camera", "--whill-state", "whill/states/model_cr2"))
+    commands, _ = json.loads(run(DRIVE, tmp_path, "--image-topic", "camera", "--whill-state", "whill/states/model_cr2"))
     assert [0.2, 0.1] in commands and [0.0, 0.0] not in commands  # the last state but one had the joystick moved
 
 
 @pytest.mark.parametrize("topic", ["camera", "camera_of_a_base_with_stamped_commands"])
 def test_nodes_drive_on_the_names_of_humble_alone(tmp_path, topic):
-    commands = json.loads(run(DRIVE, tmp_path, "--image-topic", topic))
-    assert [0.2, 0.1] in commands and commands[-5:] == [[0.0, 0.0]] * 5
+    commands, asked = json.loads(run(DRIVE, tmp_path, "--image-topic", topic))
+    assert [0.2, 0.1] in commands and commands[-5:] == [[0.0, 0.0]] * 5 and asked == []
+
+
+def test_joystick_is_locked_while_the_vehicle_is_armed_and_unlocked_when_its_rider_moves_it(tmp_path):
+    words = ("--image-topic", "camera", "--whill-state", "whill/states/model_cr2", "--joystick-lock")
+    commands, asked = json.loads(run(DRIVE, tmp_path, *words))
+    assert [0.2, 0.1] in commands and asked == [[1, 0]]

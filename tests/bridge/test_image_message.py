@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bridge import image as image_module
-from bridge.image import CHANNELS, ImageError, area_resize, compressed_to_rgb8, pillow_decoder, to_rgb8
+from bridge.image import CHANNELS, ImageError, RawImage, area_resize, compressed_to_rgb8, pillow_decoder, to_rgb8
 
 pytestmark = pytest.mark.quick
 RED, BLUE = (255, 0, 0), (0, 0, 255)
@@ -17,22 +17,22 @@ RED, BLUE = (255, 0, 0), (0, 0, 255)
 @pytest.mark.parametrize("shape", [(64, 64), (720, 1280), (37, 61)])
 def test_red_scene_is_red_in_either_encoding(encoding, stored, shape):
     data = np.tile(np.array(stored, np.uint8), (*shape, 1)).tobytes()
-    image = to_rgb8(*shape, encoding, shape[1] * 3, data)
+    image = to_rgb8(RawImage(*shape, encoding, shape[1] * 3, data))
     assert image.shape == (64, 64, 3) and image.dtype == np.uint8 and image.flags.c_contiguous
     assert (image == RED).all()
 
 
 def test_image_of_the_right_size_is_passed_on_unchanged():
     pixels = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
-    assert (to_rgb8(64, 64, "rgb8", 192, array.array("B", pixels.tobytes())) == pixels).all()
-    assert (to_rgb8(64, 64, "bgr8", 192, pixels.tobytes()) == pixels[:, :, ::-1]).all()
+    assert (to_rgb8(RawImage(64, 64, "rgb8", 192, array.array("B", pixels.tobytes()))) == pixels).all()
+    assert (to_rgb8(RawImage(64, 64, "bgr8", 192, pixels.tobytes())) == pixels[:, :, ::-1]).all()
 
 
 def test_padding_at_the_end_of_rows_is_ignored():
     pixels = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     rows = np.full((64, 200), 7, np.uint8)
     rows[:, :192] = pixels.reshape(64, 192)
-    assert (to_rgb8(64, 64, "rgb8", 200, rows.tobytes()) == pixels).all()
+    assert (to_rgb8(RawImage(64, 64, "rgb8", 200, rows.tobytes())) == pixels).all()
 
 
 @pytest.mark.parametrize("shape", [(12, 20), (1, 1), (9, 7), (3, 50), (50, 3), (8, 8)])
@@ -68,7 +68,9 @@ GOOD = dict(height=4, width=6, encoding="rgb8", step=18, data=bytes(72))
 ])
 def test_message_that_contradicts_itself_is_refused_with_field_value_rule_and_remedy(change, named):
     with pytest.raises(ImageError, match=named) as refusal:
-        to_rgb8(**{**GOOD, **change})
+        fields = {**GOOD, **change}
+        crop = fields.pop("crop", None)
+        to_rgb8(RawImage(**fields), crop=crop)
     assert str(refusal.value).count(". ") >= 1 and str(refusal.value).endswith(".")
 
 
@@ -80,7 +82,7 @@ def test_thousand_random_messages_give_an_image_or_a_refusal_and_nothing_else():
         step = int(3 * width + rng.integers(-1, 3))
         data = bytes(max(0, int(height) * step + rng.integers(-1, 2)))
         try:
-            images += to_rgb8(int(height), int(width), "rgb8", step, data, (8, 8)).shape == (8, 8, 3)
+            images += to_rgb8(RawImage(int(height), int(width), "rgb8", step, data), (8, 8)).shape == (8, 8, 3)
         except ImageError:
             continue
     assert 100 < images < 900
@@ -107,7 +109,7 @@ def test_one_scene_looks_the_same_in_every_encoding(encoding, shape):
     scene = np.stack([60 + 120 * rows / shape[0], 60 + 120 * columns / shape[1], 200 - 90 * rows / shape[0]], axis=-1)
     pixels = np.rint(scene).astype(np.uint8)
     stored = np.ascontiguousarray(encode(pixels, encoding))
-    got = to_rgb8(*shape, encoding, shape[1] * CHANNELS[encoding], stored.tobytes())
+    got = to_rgb8(RawImage(*shape, encoding, shape[1] * CHANNELS[encoding], stored.tobytes()))
     want = area_resize(pixels, (64, 64)).astype(float)
     if encoding == "mono8":
         want = np.repeat(want @ np.array([[0.299], [0.587], [0.114]]), 3, axis=2)
@@ -119,13 +121,13 @@ def test_one_scene_looks_the_same_in_every_encoding(encoding, shape):
 @pytest.mark.parametrize("colour", [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (0, 0, 0)])
 def test_pure_colours_survive_yuv(encoding, colour):
     pixels = np.tile(np.array(colour, np.uint8), (8, 8, 1))
-    got = to_rgb8(8, 8, encoding, 16, encode(pixels, encoding).tobytes(), (4, 4))
+    got = to_rgb8(RawImage(8, 8, encoding, 16, encode(pixels, encoding).tobytes()), (4, 4))
     assert np.abs(got.astype(int) - colour).max() <= 3
 
 
 def test_crop_is_what_the_policy_sees():
     pixels = np.random.default_rng(4).integers(0, 256, (100, 120, 3), np.uint8)
-    got = to_rgb8(100, 120, "rgb8", 360, pixels.tobytes(), (64, 64), (10, 20, 80, 90))
+    got = to_rgb8(RawImage(100, 120, "rgb8", 360, pixels.tobytes()), (64, 64), (10, 20, 80, 90))
     assert (got == area_resize(pixels[10:90, 20:110], (64, 64))).all()
 
 

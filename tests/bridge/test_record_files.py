@@ -8,6 +8,7 @@ import tomllib
 
 import pytest
 
+from bridge.exits import Exit
 from bridge.record import believed, finish, main, parse_arguments, toml_text, write_dataset_file
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 from bridge.split_writer import SplitWriter
@@ -25,7 +26,7 @@ def test_trial_has_the_columns_of_the_format_and_one_time_origin(tmp_path):
     writer = TrialWriter(tmp_path, "circle_1")
     for t in (900.0, 999.0):  # before the first pose only the command in force matters
         writer.command(t, t / 1000, 0.0)
-    writer.odometry(1000.0, 0.0, 0.0, 0.0, 0.1, 0.0)
+    writer.odometry(1000.0, (0.0, 0.0, 0.0), (0.1, 0.0))
     writer.command(1000.05, 0.5, -0.2)
     writer.command(1000.05, 0.5, -0.2)
     writer.ground_truth(1000.1, 3.0, 4.0, 1.5)
@@ -47,7 +48,7 @@ def test_odometry_is_moved_to_the_origin_and_its_heading_unwrapped(tmp_path):
         yaw = 1.0 + 0.13 * i
         wrapped = math.remainder(yaw, 2 * math.pi)
         x, y = 5 + math.sin(yaw) - math.sin(1.0), 6 - math.cos(yaw) + math.cos(1.0)
-        writer.odometry(i * 0.05, x, y, wrapped, 1.0, 1.0)
+        writer.odometry(i * 0.05, (x, y, wrapped), (1.0, 1.0))
     rows = read(writer.close() / "odometry.csv")
     for i, row in enumerate(rows):
         turn = 0.13 * i
@@ -58,10 +59,10 @@ def test_odometry_is_moved_to_the_origin_and_its_heading_unwrapped(tmp_path):
 def test_recording_that_begins_with_a_manoeuvre_has_its_times_and_nothing_of_before(tmp_path):
     writer = TrialWriter(tmp_path, "turn_1")
     writer.begin(7.0)
-    writer.odometry(7.0, 3.0, 2.0, 1.5, 0.0, 0.0)  # of where the vehicle was carried from, and late
+    writer.odometry(7.0, (3.0, 2.0, 1.5), (0.0, 0.0))  # of where the vehicle was carried from, and late
     writer.ground_truth(6.95, 3.0, 2.0, 1.5)
     writer.command(7.0, 0.0, 0.0)
-    writer.odometry(7.05, 0.0, 0.0, -0.5, 0.0, 0.0)
+    writer.odometry(7.05, (0.0, 0.0, -0.5), (0.0, 0.0))
     writer.ground_truth(7.05, 1.0, 0.0, -0.5)
     folder = writer.close()
     assert [row["t"] for row in read(folder / "command.csv")] == [0.0]
@@ -80,7 +81,7 @@ def test_a_long_recording_is_split_where_the_vehicle_stands(tmp_path):
         now[0] = 0.1 * i
         v = 0.4 if 10 <= now[0] < 14 or 24 <= now[0] < 26 else 0.0
         writer.command(now[0], v, 0.0)
-        writer.odometry(now[0], 0.1 * i, 0.0, 0.0, v + 0.002, 0.0)
+        writer.odometry(now[0], (0.1 * i, 0.0, 0.0), (v + 0.002, 0.0))
     assert writer.close() is None and [name for name, _ in found] == ["walk_2", "walk_3"]
     for (name, rows), driven in zip(found, (4.0, 2.0), strict=True):
         commands = read(tmp_path / "trials" / name / "command.csv")
@@ -94,12 +95,32 @@ def test_a_long_recording_is_split_where_the_vehicle_stands(tmp_path):
 def test_a_split_recording_without_motion_writes_no_trial_and_one_that_goes_silent_ends_its_drive(tmp_path, capsys):
     now = [0.0]
     writer = SplitWriter(tmp_path, "walk", 3.0, lambda folder, rows: None, lambda: now[0])
-    writer.odometry(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    writer.odometry(0.0, (0.0, 0.0, 0.0), (0.0, 0.0))
     assert finish(writer) and "never moved" in capsys.readouterr().err and not (tmp_path / "trials").exists()
-    writer.odometry(1.0, 0.0, 0.0, 0.0, 0.3, 0.0)
+    writer.odometry(1.0, (0.0, 0.0, 0.0), (0.3, 0.0))
     now[0] = 9.0
     writer.flush()
     assert [folder.name for folder in writer.trials] == ["walk_1"]
+
+
+def test_whole_messages_of_a_standstill_wait_on_disk_and_keep_their_time_of_receipt(tmp_path, monkeypatch):
+    """An hour of images before a drive: the trial has those of its last three seconds, and the memory none."""
+    now, kept = [0.0], []
+    monkeypatch.setattr("bridge.split_writer.time.time_ns", lambda: int(now[0] * 1e9))
+    monkeypatch.setattr(TrialWriter, "message", lambda self, *message: kept.append(message))
+    writer = SplitWriter(tmp_path, "walk", 3.0, lambda folder, rows: None, lambda: now[0])
+    for i in range(3600):
+        now[0] = float(i)
+        writer.message("image", bytes, bytes([i % 256]) * 100_000)
+    assert len(writer._waiting) == 0 and sum(len(index) for _, _, index in writer._spool._parts) <= 8
+    on_disk = sum(file.seek(0, os.SEEK_END) for _, file, _ in writer._spool._parts)
+    assert on_disk <= 800_000 and not list(tmp_path.iterdir())  # files without a name: nothing is left of a killed one
+    writer.odometry(now[0], (0.0, 0.0, 0.0), (0.3, 0.0))
+    assert [(data[0], received) for _, _, data, received in kept] == [
+        (i % 256, i * 1_000_000_000) for i in (3596, 3597, 3598, 3599)]
+    writer.message("image", bytes, b"moving")
+    assert kept[-1] == ("image", bytes, b"moving") and not writer._spool._parts
+    writer.close()
 
 
 def test_values_that_are_not_finite_are_left_out(tmp_path):
@@ -154,7 +175,7 @@ def test_ros_arguments_are_passed_on():
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
 def test_full_disk_ends_the_recording_with_its_cause_and_keeps_what_was_written(tmp_path, capsys):
     writer = TrialWriter(tmp_path, "full")
-    writer.odometry(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    writer.odometry(0.0, (0.0, 0.0, 0.0), (0.0, 0.0))
     writer.flush()
     writer._files["command"] = open("/dev/full", "w")  # each write to it fails for want of space
     writer.command(0.1, 0.3, 0.0)
@@ -170,7 +191,7 @@ def test_full_disk_ends_the_recording_with_its_cause_and_keeps_what_was_written(
 def test_recording_of_a_killed_recorder_is_recovered_without_its_torn_row(tmp_path, capsys):
     writer = TrialWriter(tmp_path, "killed_1")
     for i in range(3):
-        writer.odometry(i * 0.1, i * 0.05, 0.0, 0.0, 0.5, 0.0, stamp=100 + i * 0.1)
+        writer.odometry(i * 0.1, (i * 0.05, 0.0, 0.0), (0.5, 0.0), stamp=100 + i * 0.1)
     writer.flush()
     (partial,) = tmp_path.glob(".killed_1.partial-*")
     assert main(["--recover", str(tmp_path)]) == 0 and partial.exists()  # its recorder still runs
@@ -183,12 +204,12 @@ def test_recording_of_a_killed_recorder_is_recovered_without_its_torn_row(tmp_pa
     assert [row["x"] for row in rows] == [0.0, 0.05, 0.1] and rows[2]["stamp"] == 100.2
     assert "recovered" in capsys.readouterr().err
     gone.mkdir()
-    assert main(["--recover", str(tmp_path)]) == 2 and "exists already" in capsys.readouterr().err
+    assert main(["--recover", str(tmp_path)]) == Exit.FAULT and "exists already" in capsys.readouterr().err
 
 
 def test_yaw_rate_of_an_imu_is_kept_with_its_stamps(tmp_path):
     writer = TrialWriter(tmp_path, "a")
-    writer.odometry(5.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    writer.odometry(5.0, (0.0, 0.0, 0.0), (0.0, 0.0))
     writer.imu(5.02, 0.3, stamp=77.25)
     assert read(writer.close() / "imu.csv") == [{"t": 0.02, "gyro": 0.3, "stamp": 77.25}]
 

@@ -45,10 +45,12 @@ for module in pkgutil.iter_modules(bridge.__path__):
 assert "rclpy" not in sys.modules
 from bridge.controller import Controller
 from bridge.drive import parse_arguments, safety_config
+from bridge.image import RawImage
 from bridge.policy import Policy
 loaded = Policy.load(policy)
 controller = Controller(loaded, safety_config(loaded, parse_arguments([policy])))
-commands = [controller.on_image(i / 10, i / 10, 0.0, 64, 64, "rgb8", 192, bytes([200 + i]) * 12288) for i in range(5)]
+images = [RawImage(64, 64, "rgb8", 192, bytes([200 + i]) * 12288) for i in range(5)]
+commands = [controller.on_image(i / 10, i / 10, 0.0, image) for i, image in enumerate(images)]
 assert commands[-1].v > 0.1 and commands[-1].reason == "", commands
 """
 

@@ -161,7 +161,7 @@ def test_the_mirror_fills_a_second_stream_of_each_instance_and_counts_for_nothin
     plain_env = echo_env(2)
     mirror = Mirror(lambda state, obs, worlds: 255 - obs[None], lambda action, worlds: -action[None])
     env = dataclasses.replace(plain_env, mirror=mirror)
-    config = tiny_config(mirror=True, learning_starts=0)
+    config = tiny_config(mirror=1, learning_starts=0)
     with pytest.raises(ValueError, match="has no mirror"):
         iteration.init_state(plain_env, config, 0)
     step = jax.jit(lambda state: iteration.train_iteration(env, config, state))

@@ -147,7 +147,7 @@ def test_seeds_side_by_side_pretrain_as_each_alone_with_a_mirror_and_targets(tmp
     )
     env = dataclasses.replace(blind_env(2), mirror=mirror)
     config = tiny_config(
-        lr=2e-3, warmup=5, mirror=True, decode_only=("range",), pretrain_steps=20, pretrain_updates=3, steps_per_iter=4,
+        lr=2e-3, warmup=5, mirror=1, decode_only=("range",), pretrain_steps=20, pretrain_updates=3, steps_per_iter=4,
         vector_layers=1,
     )  # fmt: skip
     both = train(env, config, tmp_path / "both", 0, (3, 5), QUIET)
@@ -169,7 +169,7 @@ def test_seeds_side_by_side_pretrain_as_each_alone_with_a_mirror_and_targets(tmp
     [
         (dict(pretrain_updates=0), "together with pretrain_updates"),
         (dict(pretrain_steps=0), "together with pretrain_updates"),
-        (dict(pretrain_steps=-5, pretrain_updates=-5), "together with pretrain_updates"),
+        (dict(pretrain_steps=-5, pretrain_updates=-5), "must be a whole number in 0"),
         (dict(pretrain_steps=801), "fit replay_capacity"),
     ],
 )

@@ -37,7 +37,7 @@ class Linear:
         self.evidence, self.precision = evidence, evidence.precision
         self.reference = SimpleNamespace(u=np.zeros(1), spread=SPREAD)
         self.drives = SimpleNamespace(mask=np.ones(evidence.residual.shape), repeats=np.arange(len(evidence.residual)),
-                                      simulate=self.simulate)
+                                      features=SimpleNamespace(width=0.25), simulate=self.simulate)
 
     def simulate(self, sets):
         """(N, B, K, 5) features with values (N, 5) of the base parameter and the four effects."""
@@ -52,7 +52,7 @@ class Linear:
         values[[1 + EFFECTS.index(one) for one in chosen]] = q
         return values
 
-    def fit(self, chosen, _):
+    def fit(self, chosen, *_):
         columns = self.evidence.design[..., [0, *(1 + EFFECTS.index(one) for one in chosen)]]
         flat = columns.reshape(-1, columns.shape[-1])
         matrix = flat.T @ flat
@@ -65,6 +65,11 @@ class Linear:
 
     def stuck(self, _):
         return False
+
+    def costs(self, starts):
+        left = [self.evidence.residual - self.evidence.design @ self.values_at(one.hypotheses, one.u, one.q)
+                for one in starts]
+        return np.array([np.square(one).sum() for one in left])
 
     def fit_all(self, starts, _):
         return [self.fit(start.hypotheses, None) for start in starts]

@@ -12,9 +12,9 @@ from sysid.errors.features import CHANNELS, make_features
 from sysid.errors.noise import deviations, replicate_groups
 from sysid.fit import Arguments as FitArguments
 from sysid.fit import main as fit_main
-from sysid.follow_up.tables import Table
 from sysid.follow_up.trust import advice, as_good_as_repeats, beside_still_base, warnings
 from sysid.follow_up.unnamed import vehicle_of, with_start_angles
+from sysid.follow_up.wrench_tables import WrenchTable
 from sysid.logs.log import load_log
 from sysid.logs.metrics import own_floor, score
 from sysid.logs.synthetic import Schedule, write_dataset
@@ -357,10 +357,10 @@ def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
 def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr("sysid.verdict.pipeline.find_missing",
-                        lambda *given, start: asked.append((*given, start)) or sloping)
+                        lambda *given: asked.append(given) or sloping)
     report = main(Arguments(dataset=folder / "sloping", reference=(folder / "reference_1",), out=tmp_path / "run"))
-    [(log, references, config, vehicle, _, start)] = asked
-    assert (log.name, [one.name for one in references], vehicle, start) == ("sloping", ["reference_1"], None, None)
+    [(log, references, config, vehicle, _)] = asked
+    assert (log.name, [one.name for one in references], vehicle) == ("sloping", ["reference_1"], None)
     assert config.seed == 0
     assert json.loads((tmp_path / "run/report.json").read_text())["verdict"] == report["verdict"] == "named"
     assert "verdict: named" in capsys.readouterr().out
@@ -369,8 +369,8 @@ def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, caps
     assert "something unknown" in (tmp_path / "run/report.html").read_text()
     main(Arguments(dataset=folder / "sloping", reference=(folder / "plain",), vehicle=tmp_path / "run/vehicle.toml",
                    out=tmp_path / "again"))
-    *_, vehicle, _, start = asked[-1]
-    assert vehicle is None and set(describe(start)) >= set(describe(sloping.reference.params))
+    *_, vehicle, _ = asked[-1]
+    assert not vehicle.kept and set(describe(vehicle.params)) >= set(describe(sloping.reference.params))
 
 
 def test_refit_to_poses_lowers_the_training_error(drives, sloping):
@@ -395,7 +395,7 @@ def test_refit_to_poses_lowers_the_training_error(drives, sloping):
 def test_a_wrench_without_a_name_is_there_when_its_vehicle_is_replayed(drives, sloping):
     """Refits to poses replay like this too: without the wrench, base parameters would move to stand for it."""
     trials = tuple(one for one in drives["plain"].training if one.name == "straight_1")
-    push = Table("speed", "push", -1.0, 1.0).parameters(np.repeat([-20.0, 0.0], KNOTS), 0.0)
+    push = WrenchTable("speed", "push", -1.0, 1.0).parameters(np.repeat([-20.0, 0.0], KNOTS), 0.0)
     pushed = vehicle_of(sloping, {f"unnamed.{name}": value for name, value in push.items()})
     [free], [held] = (replay(sloping, one, trials) for one in (sloping.reference.params, pushed))
     ends = [np.array([one.ground_truth.x[-1], one.ground_truth.y[-1]]) for one in (free, held)]
@@ -405,7 +405,7 @@ def test_a_wrench_without_a_name_is_there_when_its_vehicle_is_replayed(drives, s
 def test_replicates_start_at_their_own_angle_of_a_wheel_that_is_out_of_balance(drives, sloping):
     trials = tuple(one for one in drives["plain"].training if one.name in ("straight_1", "straight_2"))
     force = 40 * np.sin(np.arange(KNOTS) * 2 * np.pi / KNOTS)
-    push = Table("left wheel's angle", "push", 0.0, 1.0).parameters(np.concatenate([force, np.zeros(KNOTS)]), 0.0)
+    push = WrenchTable("left wheel's angle", "push", 0.0, 1.0).parameters(np.concatenate([force, np.zeros(KNOTS)]), 0.0)
     pushed = vehicle_of(sloping, {f"unnamed.{name}": value for name, value in push.items()})
     speeds = []
     for angles in ([0.0, 0.0], [0.0, np.pi]):
@@ -444,7 +444,7 @@ def test_replicates_move_alike_unless_the_room_does_something(drives, sloping):
     for one in ready.hypotheses:
         row = {**base, **one.values(np.ones(len(one.axes)), base)}
         values.append([row[name] for name in base])
-    made = make_drives(ready.plant, ready.full, ready.names, drives["plain"].training, paths=ready.paths)
+    made = make_drives(ready.vehicle, drives["plain"].training, paths=ready.paths)
     once = made.simulate(np.array(values))
     every = replace(made, courses=replace(made.courses, shared=False)).simulate(np.array(values))
     assert len(made.courses.first) == 3 < len(made.trials)
@@ -478,6 +478,8 @@ def test_vehicles_with_the_same_effects_share_what_was_compiled(sloping):
     assert again.paths is first.paths
     assert moved[list(again.names).index("body.mass")] == pytest.approx(1.5 * mass)
     assert np.abs(again.simulate(moved[None]) - first.simulate(values[None])).max() > 1e-3
+    named, _ = drives_of(sloping, trials, with_effects(wider, ("slope",)))  # that every vehicle of the result may have
+    assert named.paths is first.paths
     other, _ = drives_of(sloping, trials, with_effects(sloping.reference.params, ("axle_pivot",)))
     assert other.paths is not first.paths
 

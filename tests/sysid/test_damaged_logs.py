@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
 import shutil
 import zipfile
 
 import numpy as np
 import pytest
-from damage import few
+from damage import Costs, damaged_table, few
 from damaged_bytes import check, check_packed
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,6 +29,8 @@ from sysid.missing.fit_statistics import FitStatistics, Leftovers, load_fitted
 from sysid.pages.report import read_report, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, load, save
 from sysid.replay.robot_loading import load_robot
+from sysid.verdict.posterior import Thresholds, posterior
+from sysid.verdict.posterior import read as read_evidence
 from whill_mjx.logs.dataset import write_fields, write_trial
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.vehicle_file import save_vehicle
@@ -161,6 +164,33 @@ def test_the_damaged_motion_beside_a_fit(run):
         load(run)
 
     check(source, about, pack_and_read)
+
+
+SOME = {"excess": 0.4, "common": 0.3, "smooth": 90.0}
+EVIDENCE = {"schema": 1, "kind": "sysid-evidence", "excess": 0.9, "p_scan": 1e-6, "p_pairs": 0.2, "p_refit": 1e-5,
+            "count": 4000.0, "trials": 12, "day": 0.05, "freedom": 12.0, "usual": 3.0, "noise": ["gyro"],
+            "against": {"slope+wind": ["it is not foretold"]}, "sets": [
+                {"effects": ["slope", "wind"], "variants": ["slope", "wind"], "coordinates": [0.1, 0.2], "gain": 900.0,
+                 "p": [1e-6, 1e-4], "p_value": 1e-6, "left": SOME, "own": [700.0, 100.0], "foretold": [300.0, 20.0],
+                 "bent": SOME, "classes": [["slope"], ["wind", "slope"]]}]}  # fmt: skip
+
+
+def test_damaged_evidence_of_a_verdict(tmp_path):
+    path = tmp_path / "evidence.json"
+
+    @few(60)
+    @given(damaged_table(EVIDENCE))
+    def judged(content):
+        path.write_bytes(content)
+        with Costs():
+            try:
+                posterior(read_evidence(path), Thresholds())
+            except ValueError as error:
+                assert str(error).startswith(str(path)) and "\n" not in str(error)
+
+    path.write_text(json.dumps(EVIDENCE))
+    assert posterior(read_evidence(path), Thresholds()).verdict
+    judged()
 
 
 def test_the_damaged_report_of_a_fit(run):

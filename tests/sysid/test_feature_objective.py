@@ -64,11 +64,11 @@ def test_a_pose_that_comes_too_seldom_is_not_told_by_bins(features):
 
 def test_a_prior_pulls_a_fit_of_features_as_far_as_it_is_sure(features):
     fine = features.renewed(U_TRUTH)
-    free = least_squares.fit(fine, fine.space, iterations=8).u
+    free = least_squares.fit(fine, stop=least_squares.Stopping(8)).u
     away = np.clip(free + 0.1, 0.0, 1.0)
     for sd, expected in ((1e-5, away), (10.0, free)):
         held = dataclasses.replace(fine, prior=Prior(away, np.full(3, sd)))
-        np.testing.assert_allclose(least_squares.fit(held, fine.space, iterations=12).u, expected, atol=5e-3)
+        np.testing.assert_allclose(least_squares.fit(held, stop=least_squares.Stopping(12)).u, expected, atol=5e-3)
 
 
 def test_replays_of_many_sets_at_once_are_those_of_a_few(features):

@@ -39,7 +39,8 @@ def test_a_weak_prior_yields_to_the_log_and_a_sharp_one_holds(objective):
     """The log tells all three: a weak prior at wrong values hardly moves them, a sharp one does."""
     wrong = U_TRUTH + np.array([0.1, 0.0, 0.1])
     weak, sharp = (dataclasses.replace(objective, prior=Prior(wrong, np.full(3, sd))) for sd in (0.2, 1e-5))
-    ends = [least_squares.fit(one, one.space, starts=U_TRUTH[None] + 0.05, iterations=12).u for one in (weak, sharp)]
+    ends = [least_squares.fit(one, starts=U_TRUTH[None] + 0.05,
+                              stop=least_squares.Stopping(12)).u for one in (weak, sharp)]
     assert np.abs(ends[0] - U_TRUTH).max() < 0.02
     assert np.abs(ends[1] - wrong).max() < 0.02
     free = uncertainty.estimate(objective, ends[0])
@@ -61,7 +62,7 @@ def test_what_no_drive_tells_stays_in_the_middle_of_its_bounds_and_takes_nothing
                   np.append(UNICYCLE_SPACE.log, False))
     free = Objective(DifferenceReplay(replay, space), space, trials, replay.measured, estimate_noise(trials))
     held = dataclasses.replace(free, prior=bounds_alone(space))
-    found = space.to_values(least_squares.fit(held, space, iterations=20, tolerance=1e-6).u)
+    found = space.to_values(least_squares.fit(held, stop=least_squares.Stopping(20, 1e-6)).u)
     assert found[3] == pytest.approx(0.5, abs=0.15)
     assert found[0] + 0.1 * found[3] == pytest.approx(TRUTH[0], abs=0.01)
     known = uncertainty.estimate(held, space.to_unit(found)).estimates

@@ -75,8 +75,8 @@ def test_random_starts_in_features_agree_and_lie_where_the_poses_fit_best(poses)
     found = starts.fit(poses, points, WHILL_CR.track, iterations=20)
     assert starts.agreeing(found.start_costs) == 6
     np.testing.assert_allclose(poses.space.to_values(found.u), TRUTH, rtol=0.1)
-    polished = least_squares.fit(poses, poses.space, starts=found.u[None], iterations=8)
-    direct = least_squares.fit(poses, poses.space, iterations=30)
+    polished = least_squares.fit(poses, starts=found.u[None], stop=least_squares.Stopping(8))
+    direct = least_squares.fit(poses, stop=least_squares.Stopping(30))
     assert polished.cost <= direct.cost * 1.001
 
 
@@ -89,9 +89,9 @@ def test_a_drawn_start_is_near_the_truth_and_does_not_depend_on_the_others(poses
 
 def test_each_end_of_a_search_is_told_with_the_start_it_comes_from(features):
     points = least_squares.random_starts(features.space, 4, seed=2)
-    found = least_squares.fit(features, features.space, starts=points, iterations=1)
+    found = least_squares.fit(features, starts=points, stop=least_squares.Stopping(1))
     for end, number in zip(found.starts, found.order, strict=True):
-        alone = least_squares.fit(features, features.space, starts=points[number][None], iterations=1)
+        alone = least_squares.fit(features, starts=points[number][None], stop=least_squares.Stopping(1))
         np.testing.assert_allclose(end, alone.u, atol=1e-5)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.plant.make import make_log
+from benchmarks.plant.make import Experiment, make_log
 from benchmarks.plant.sensors import Gyro
 from sysid.errors.features import CHANNELS, GYRO, channel_names, make_features
 from sysid.errors.pose_objective import estimate_noise
@@ -192,7 +192,7 @@ def test_a_gyro_narrows_what_turns_the_contact_plant_and_a_wrong_one_does_no_har
     """The independent plant, whose effects follow other laws: a chair on one day, with and without a gyro."""
     values = {}
     for name, gyro in {"none": None, "good": Gyro(), "wrong": Gyro(bias=0.02, scale=-1.04)}.items():
-        make_log(tmp_path / name, seed=3, manoeuvres=["s_curve", "turn", "circle"], replicates=1, gyro=gyro)
+        make_log(tmp_path / name, Experiment(seed=3, manoeuvres=["s_curve", "turn", "circle"], replicates=1, gyro=gyro))
         fit = fit_log(load_log(tmp_path / name), FitConfig(starts=1, iterations=6, quick=True, physics_dt=0.01))
         error = fit.uncertainty.deviation * fit.space.slope(fit.u)
         values[name] = dict(zip(fit.space.names, zip(fit.space.to_values(fit.u), error, strict=True), strict=True))

@@ -161,6 +161,8 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     assert any("moves against its own yaw" in one for one in sanity(log_of(backwards)))
     degrees = replace(good, odometry=replace(good.odometry, omega=np.rad2deg(good.odometry.omega)))
     assert any("check its unit (rad/s)" in one for one in sanity(log_of(degrees)))
+    folded = replace(good, ground_truth=replace(good.ground_truth, yaw=np.sin(good.ground_truth.yaw / 2)))
+    assert not any("sign is reversed" in one for one in sanity(log_of(folded)))
     swapped = replace(good, command=Command(good.command.t, good.command.omega, good.command.v))
     assert any("the two columns are exchanged" in one for one in sanity(log_of(swapped)))
     millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
@@ -180,6 +182,12 @@ def lost(pose, **values):
     return replace(pose, **{name: np.where(gone, one, getattr(pose, name)) for name, one in values.items()})
 
 
+def inverted(pose):
+    """The fixed frame as the vehicle sees it."""
+    cos, sin = np.cos(pose.yaw), np.sin(pose.yaw)
+    return replace(pose, x=-cos * pose.x - sin * pose.y, y=sin * pose.x - cos * pose.y, yaw=-pose.yaw)
+
+
 def turned(pose, degrees):
     return replace(pose, yaw=pose.yaw + np.deg2rad(degrees))
 
@@ -194,6 +202,11 @@ def turned(pose, degrees):
     (lambda pose: lost(pose, yaw=pose.yaw + np.pi), "its pose jumps by 3.* rad .* took another body"),
     (lambda pose: replace(pose, yaw=0 * pose.yaw), "its yaw never changes, though .* turns"),
     (lambda pose: replace(pose, y=0 * pose.y), "its y never changes, though .* another axis up"),
+    (lambda pose: inverted(pose), "parent and child are exchanged"),
+    (lambda pose: replace(pose, t=pose.t + 18.0), "its motion comes (17.9|18.0|18.1) s later .* another clock"),
+    (lambda pose: replace(pose, x=pose.x - np.sin(pose.yaw), y=pose.y + np.cos(pose.yaw)), "(0.9|1.0). m to the left"),
+    (lambda pose: replace(pose, **{name: np.where(pose.t > 9, getattr(pose, name)[180], getattr(pose, name))
+                                   for name in ("x", "y", "yaw")}), "its rows repeat while the odometry moves on"),
 ])
 def test_an_outside_pose_that_contradicts_the_odometry_is_named_and_no_sign_is_said_to_be_reversed(change, said):
     good = trial_of(lively())
@@ -219,6 +232,8 @@ def held_up(o):
     (lambda o: replace(o, v=o.v * np.cos(o.yaw)), "the twist is in the frame odom"),
     (lambda o: replace(o, v=0 * o.v), "its pose moves .*, but its speeds v are all zero"),
     (lambda o: replace(o, x=-o.y, y=o.x), "its pose moves 90 deg to the left of its own heading"),
+    (lambda o: replace(o, y=-o.y, yaw=-o.yaw), "its yaw turns against its own omega"),
+    (lambda o: inverted(o), "parent and child are exchanged"),
 ])
 def test_odometry_whose_pose_and_speeds_contradict_each_other_is_named(change, said):
     good = trial_of(lively())
@@ -348,6 +363,15 @@ def test_commands_of_another_clock_and_cut_off_ones_are_named_and_no_sign_or_uni
     first = command.t < 6.0
     (found,) = sanity(log_of(replace(good, command=Command(command.t[first], command.v[first], command.omega[first]))))
     assert re.search("the commands end .* s before the odometry", found)
+
+
+@pytest.mark.parametrize(("stream", "rate"), [("ground_truth", 0.05), ("odometry", -0.04)])
+def test_a_clock_that_runs_fast_or_slow_is_named_with_its_stream_and_rate(stream, rate):
+    good = trial_of(lively())
+    source = getattr(good, stream)
+    (found,) = sanity(log_of(replace(good, **{stream: replace(source, t=source.t * (1 + rate))})))
+    assert found.startswith(f"{stream}: its clock runs") and ("faster" if rate > 0 else "slower") in found
+    assert float(re.search(r"runs about (\d)%", found)[1]) == pytest.approx(100 * abs(rate), abs=1)
 
 
 def test_a_base_that_drives_on_while_commands_pause_is_fine():

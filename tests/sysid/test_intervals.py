@@ -91,7 +91,7 @@ def test_the_height_of_the_mass_is_told_as_far_on_either_side_where_a_log_tells_
     design = random.standard_normal((DRIVES, SAMPLES, 1))
     objective = Growing(design, 2.6 * random.standard_normal((DRIVES, SAMPLES)))
     objective.space = dataclasses.replace(objective.space, names=(name,))
-    u = least_squares.fit(objective, objective.space, iterations=20).u
+    u = least_squares.fit(objective, stop=least_squares.Stopping(20)).u
     (told,) = uncertainty.estimate(objective, u).estimates
     low, middle, high = (objective.level(one) for one in (told.low, u[0], told.high))
     assert told.high - told.low > 0.2
@@ -116,7 +116,7 @@ def designs(random: np.random.Generator) -> np.ndarray:
 
 def covered(objective: Linear) -> tuple[list[bool], np.ndarray]:
     """Whether the interval of each parameter holds the truth, 0.5, and the fit (P,)."""
-    u = least_squares.fit(objective, objective.space, iterations=4).u
+    u = least_squares.fit(objective, stop=least_squares.Stopping(4)).u
     return [one.low <= 0.5 <= one.high for one in uncertainty.estimate(objective, u).estimates], u
 
 
@@ -188,7 +188,7 @@ def test_errors_that_replicates_share_at_places_of_their_drives_are_counted_once
             places = random.standard_normal((DRIVES // 2, uncertainty.PIECES))
             errors = shared * np.repeat(np.repeat(places, SAMPLES // uncertainty.PIECES, axis=1), 2, axis=0)
             objective = Linear(design, random.standard_normal((DRIVES, SAMPLES)) + errors)
-            u = least_squares.fit(objective, objective.space, iterations=4).u
+            u = least_squares.fit(objective, stop=least_squares.Stopping(4)).u
             known = uncertainty.estimate(objective, u)
             held.append([one.low <= 0.5 <= one.high for one in known.estimates])
             width.append(known.quantile * known.deviation)
@@ -218,7 +218,7 @@ def test_a_parameter_that_one_drive_tells_is_not_judged_between_drives():
     design = designs(random)
     design[1:, :, 2] = 0.0
     objective = Linear(design, correlated(random, 0.0))
-    u = least_squares.fit(objective, objective.space, iterations=4).u
+    u = least_squares.fit(objective, stop=least_squares.Stopping(4)).u
     known = uncertainty.estimate(objective, u)
     independent = np.sqrt(np.linalg.inv(np.einsum("bkp,bkq->pq", design, design))[2, 2])
     assert known.deviation[2] > 0.9 * independent
@@ -228,7 +228,7 @@ def test_a_parameter_that_one_drive_tells_is_not_judged_between_drives():
 def test_an_error_of_the_odometrys_start_is_absorbed_as_far_as_its_noise_allows(unicycle_log):
     """The odometry counts from the mean of a noisy standstill: turned by that error, all of it is off."""
     objective = unicycle_objective(unicycle_log.training)
-    u = least_squares.fit(objective, objective.space, iterations=8).u
+    u = least_squares.fit(objective, stop=least_squares.Stopping(8)).u
     assert all(0 < trial.start.odometry_yaw_sigma < 1e-3 for trial in objective.trials)
     off = 5e-4  # rad
     odometry = objective.measured.odometry.copy()
@@ -266,7 +266,7 @@ def test_a_nuisance_is_never_told_and_its_interval_is_its_bounds():
     plain, other = (Linear(designs(np.random.default_rng(6)), correlated(random, 0.0)) for _ in range(2))
     other._errors = plain._errors
     other.space = dataclasses.replace(plain.space, names=("a", "torque_drive.period", "c"))
-    u = least_squares.fit(plain, plain.space, iterations=4).u
+    u = least_squares.fit(plain, stop=least_squares.Stopping(4)).u
     usual, known = (uncertainty.estimate(one, u).estimates for one in (plain, other))
     assert usual[1].identifiable and not known[1].identifiable and "not identifiable" in known[1].remark
     assert (known[1].low, known[1].high) == (0.0, 1.0)
@@ -279,8 +279,9 @@ def test_an_interval_reaches_as_far_down_as_up_on_the_scale_on_which_it_is_told(
     names = ("wheel_inertia.ratio", "torque_drive.kp")
     space = Space(names, np.full(2, 0.2), np.full(2, 20.0), np.full(2, 2.0), np.ones(2, bool))
     scores = 5.0 * np.random.default_rng(0).standard_normal((12, 8, 2))
-    told = independence.Evidence(np.full(2, 0.5), scores - scores.mean((0, 1)), np.tile(9.0 * np.eye(2), (12, 8, 1, 1)),
-                                 np.arange(12) // 2, 1.0, 1.0, np.eye(2), 1.0)
+    parts = np.tile(9.0 * np.eye(2), (12, 8, 1, 1))
+    told = independence.Information(np.full(2, 0.5), scores - scores.mean((0, 1)), parts, np.arange(12) // 2, 1.0, 1.0,
+                                    np.eye(2), 1.0)
     wheels, gain = uncertainty.uncertainty_of(told, space).estimates
     assert wheels.identifiable and gain.identifiable and wheels.high > 2.5
     assert wheels.high - wheels.value == pytest.approx(wheels.value - wheels.low)

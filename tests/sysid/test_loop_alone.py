@@ -14,6 +14,7 @@ from sysid.errors.features import BIN, bin_width, make_features
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import no_wander
+from sysid.missing.joint_fit import Start as JointStart
 from sysid.missing.signatures import manoeuvre_groups
 from sysid.replay.rollout import Commanded, make_batch, path_of
 from sysid.verdict import alone
@@ -21,7 +22,8 @@ from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
 from sysid.verdict.found import Candidate, Effort
 from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
-from sysid.verdict.rounds import Asked, begin
+from sysid.verdict.result import LoopConfig
+from sysid.verdict.rounds import Asked, begin, nearer
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 
@@ -71,10 +73,15 @@ def test_windows_without_replicates_are_put_into_eighths_and_replicates_are_not(
     assert not stands_alone(again, known=False)
 
 
+def asked_of(evidence, refitter):
+    ready = SimpleNamespace(hypotheses=EFFECTS, wander=no_wander(evidence.columns))
+    return begin(evidence, ready, refitter, LoopConfig(draws=300))
+
+
 def verdict(sizes, wheels=True, **more):
     """The verdict on linear drives that stand alone."""
     evidence = drives(sizes, **more)
-    asked = begin(evidence, EFFECTS, Linear(evidence), no_wander(evidence.columns), Thresholds(), draws=300)
+    asked = asked_of(evidence, Linear(evidence))
     return search_alone(asked, wheels=wheels)
 
 
@@ -87,6 +94,43 @@ def test_effects_are_added_as_long_as_they_predict_blocks_that_were_held_back():
     assert named(found) == ("named", ["side_force", "command_scale"])
     assert [one.hypothesis.effect for one in found.rounds[1]][0] == "command_scale" and len(found.rounds) == 3
     assert UNTOLD in found.reason and found.excess[1] < found.excess[0]
+
+
+class Slow(Linear):
+    """Fits that go a tenth of what is left of the way in each iteration."""
+
+    def fit(self, chosen, q, iterations=12):
+        return self.fit_all([JointStart(tuple(chosen), self.reference.u, q)], iterations)[0]
+
+    def fit_all(self, starts, iterations):
+        return [self.on_the_way(start, 0.9**iterations) for start in starts]
+
+    def on_the_way(self, start, left):
+        end, size = super().fit(start.hypotheses, None), len(start.u)
+        at = np.concatenate([end.u, end.q])
+        away = left * (np.concatenate([start.u, start.q]) - at)
+        residual = end.residual - end.jacobian @ away
+        return replace(end, u=(at + away)[:size], q=(at + away)[size:], cost=float(np.square(residual).sum()),
+                       residual=residual)
+
+
+def test_a_fit_starts_where_the_drives_fit_better_than_without_the_effect():
+    linear = Linear(drives((0.0, 0.0, 1.0, 0.0)))
+    current = linear.fit((), None)
+    starts = [JointStart(EFFECTS[2:3], current.u, np.array([size])) for size in (1.5, 8.0)]
+    first, second = nearer(linear, starts, current)
+    assert first is starts[0] and second.q == pytest.approx([0.8])
+
+
+def test_no_effect_is_credited_with_what_the_fit_before_it_had_not_found_yet():
+    evidence = drives((0.0, 0.0, 2.0, 0.0))
+    asked = asked_of(evidence, Slow(evidence))
+    small = replace(asked.scan, q=tuple(0.1 * q for q in asked.scan.q))  # a linear scan may be far off
+    found = search_alone(replace(asked, far=None, scan=small))
+    exact = verdict((0.0, 0.0, 2.0, 0.0))
+    assert named(found) == named(exact) == ("named", ["side_force"])
+    assert found.accepted[0].gain == pytest.approx(exact.accepted[0].gain, rel=1e-3)
+    assert max(one.gain for one in found.rounds[1]) < 10  # chance
 
 
 def test_what_every_block_asks_another_size_of_is_not_named():

@@ -31,7 +31,8 @@ class Linear:
         self.signatures = np.stack([first[::-1], first, second(self, first)], -1)
         self.precision, self.groups = np.eye(1), GROUPS
         self.reference = SimpleNamespace(u=np.zeros(1))
-        self.drives = SimpleNamespace(simulate=lambda sets: np.stack([self.features(one) for one in sets]))
+        self.drives = SimpleNamespace(simulate=lambda sets: np.stack([self.features(one) for one in sets]),
+                                      features=SimpleNamespace(width=0.25))
         law = first * (1 + form * np.abs(self.motion[..., :1]))
         self.data = self.features(np.array([0.0, 0.0, truth[1]])) + truth[0] * law + rng.standard_normal(first.shape)
 
@@ -75,6 +76,18 @@ def test_what_other_forms_of_the_first_effect_explain_is_no_gain_of_a_second(sec
     assert (apart.min() > 0.2 * plain) == own
     assert np.square(found.left(0.5)).mean() == pytest.approx(1.0, abs=0.05)
     assert own or np.square(model.fit(1).residual).mean() > 1.2  # by its law alone the first leaves more
+
+
+def test_the_curve_of_a_form_shows_over_which_quantity_an_effect_is_larger_than_its_law():
+    model = Linear(unrelated, (3.0, 0.0), 0.5)
+    fit = model.fit(1)
+    speed, turning, time = forms_of(model, fit, GROUPS).deviations(0.5, 0)
+    assert [one.quantity for one in (speed, turning, time)] == ["speed", "yaw rate", "time in the drive"]
+    planted = 3.0 * (1 + 0.5 * np.abs(speed.at)) / fit.q[0] - 1  # off the size that is found on average
+    assert np.mean(np.abs(speed.share - planted) < 2 * speed.error) > 0.8 and speed.share.max() > 5 * speed.error.max()
+    for one in (turning, time):  # it does not depend on these
+        assert np.abs(one.share / np.maximum(one.error, 1e-9)).max() < 3
+    assert time.at[[0, -1]].tolist() == [0.0, BINS * 0.25]
 
 
 def test_columns_of_other_forms_are_the_effect_itself_where_nothing_modulates_it():

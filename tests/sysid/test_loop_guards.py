@@ -16,7 +16,7 @@ from sysid.verdict.falsifiers import QUIET, SPLITS, side
 from sysid.verdict.found import Candidate, Search
 from sysid.verdict.guards import guarded
 from sysid.verdict.posterior import Thresholds
-from sysid.verdict.result import Stood
+from sysid.verdict.result import Support
 from whill_mjx.effects import EFFECTS
 from whill_mjx.effects.card import GONE_WHEN_SETTLED, QUANTITIES, STATES, Axis, Falsifier
 from whill_mjx.vehicle.presets import preset
@@ -86,7 +86,8 @@ def fitted(sizes, weight=(1.0, 1.0), trials=6, bins=600, prediction=None):
     parts = np.stack([effect * q[1] * ~half, effect * q[1] * half], axis=-1)
     refitter = SimpleNamespace(precision=np.eye(1), reference=SimpleNamespace(u=np.zeros(1)))
     size, covariance = sizes_in_parts(fit, slice(0, 1), parts, refitter, [[2 * k, 2 * k + 1] for k in range(3)])
-    return size, covariance, falsification._same("slope", prediction or SIGN, size, covariance, 8, 0.003)
+    law = falsification.Law("slope", prediction or SIGN, 0.003)
+    return size, covariance, falsification._same(law, size, covariance, 8)
 
 
 def test_an_effect_with_one_size_stands_its_split():
@@ -117,19 +118,12 @@ def test_drives_that_show_an_effect_in_one_part_only_contradict_nothing():
 
 @pytest.mark.parametrize(("other", "outcome"), [(0.0, "falsified"), (3.0, "holds")])
 def test_what_is_left_where_an_effect_does_nothing_may_be_another_ones_form(other, outcome):
-    """The first effect acts late only, and early twice the noise is left; the second one acts everywhere."""
-    rng = np.random.default_rng(3)
-    columns = rng.standard_normal((6, 600, 3))
-    columns[:, :300, 1] = 0.0
-    residual = rng.standard_normal((6, 600)) * np.where(np.arange(600) < 300, 2.0, 1.0)
-    effects = tuple(Hypothesis(name, (Axis(name, 1.0),)) for name in ("command_delay", "slope"))
-    q = np.array([1.0, other])
-    fit = Refit(effects, np.zeros(1), q, 0.0, residual, columns, q)
-    quiet = np.zeros((6, 600, 1), bool)
-    quiet[:, :300] = True
+    """Twice the noise is left in bins where the effect does nothing, which gains as much as `other` others do."""
+    residual = 2.0 * np.random.default_rng(3).standard_normal(1800)
+    gains = 1800.0, 1800.0 * (1 + other**2)
     p_excess = lambda excess: 0.5 if excess < 0.2 else 1e-6  # noqa: E731
-    settled = GONE_WHEN_SETTLED
-    tested = falsification._absent("command_delay", settled, fit, slice(0, 1), np.eye(1), quiet, p_excess, 0.003)
+    law = falsification.Law("command_delay", GONE_WHEN_SETTLED, 0.003)
+    tested = falsification._absent(law, residual, gains, p_excess)
     assert tested.outcome == outcome
 
 
@@ -159,7 +153,7 @@ def test_the_course_of_a_drive_knows_its_steps_and_its_heading():
 
 def stood(outcome="agree", least=0.0, tested=(), interval=(10.0, 20.0)):
     agreement = SimpleNamespace(asked=np.ones(4, bool), outcome=outcome, least=least, scatter=2 * least)
-    return Stood("slope", np.ones(4), np.ones(4), agreement, np.ones(4), interval, tested)
+    return Support("slope", np.ones(4), np.ones(4), agreement, np.ones(4), interval, tested)
 
 
 @pytest.mark.parametrize(("one", "text"), [

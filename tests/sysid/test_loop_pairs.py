@@ -7,21 +7,28 @@ import numpy as np
 import pytest
 from linear_drives import EFFECTS, SPREAD, Linear, drives
 
-from sysid.follow_up.power import false_alarms, power_curve, simulated_days
+from sysid.follow_up.power import SEED, Days, false_alarms, power_curve
 from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
-from sysid.verdict.pairs import scan_again, scan_pairs, tail
-from sysid.verdict.posterior import Thresholds
+from sysid.verdict.found import tail
+from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
+from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import begin
-from sysid.verdict.scan import run
+from sysid.verdict.scan import null_days, run
 from sysid.verdict.search import pairs_of as pairs_of_effects
 from sysid.verdict.search import settle
 
 pytestmark = pytest.mark.quick
-def pairs_of(evidence, wander):
-    return scan_pairs(evidence, EFFECTS, SPREAD, wander, np.eye(4), 0.9, draws=200)
+def pairs_of(evidence, wander, similar=np.eye(4), draws=200):  # noqa: B008
+    nulls = null_days(evidence, SPREAD, wander, draws, np.random.default_rng((0, 2)))
+    return scan_pairs(evidence, EFFECTS, wander, nulls, similar, 0.9)
+
+
+def simulated_days(evidence, wander, scan, seed=0):
+    nulls = null_days(evidence, SPREAD, wander, 400, np.random.default_rng((seed, SEED)))
+    return Days(evidence, EFFECTS, wander, scan, nulls)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +63,7 @@ def test_pairs_of_nothing_have_no_small_p_values(wander):
 
 
 def verdict(evidence, wander):
-    asked = begin(evidence, EFFECTS, Linear(evidence), wander, Thresholds(), draws=300)
+    asked = begin(evidence, SimpleNamespace(hypotheses=EFFECTS, wander=wander), Linear(evidence), LoopConfig(draws=300))
     return settle(asked, pairs_of_effects(asked))
 
 
@@ -88,7 +95,7 @@ def test_what_resembles_two_effects_together_gives_way_to_them(wander):
 def test_one_class_is_no_pair(wander):
     alike = np.eye(4)
     alike[1, 0] = 0.95
-    found = scan_pairs(drives(np.zeros(4)), EFFECTS, SPREAD, wander, alike, 0.9, draws=50)
+    found = pairs_of(drives(np.zeros(4)), wander, alike, 50)
     assert (0, 1) not in found.members and len(found.members) == 5
 
 
@@ -100,8 +107,8 @@ def test_effects_that_wander_from_day_to_day_are_worth_less_together():
 
 def test_a_tail_of_zeros_is_no_steeper_than_that_of_chi_squared():
     null = np.concatenate([np.zeros(195), [1.0, 2.0, 3.0, 1.0, 2.0]])
-    assert tail(null, 4.0) > 0.01
-    assert tail(null, 0.0) == 1.0
+    assert tail(null, 4.0, CHI_SQUARED) > 0.01
+    assert tail(null, 0.0, CHI_SQUARED) == 1.0
 
 
 def test_the_other_effect_of_a_pair_may_come_last():
@@ -116,7 +123,7 @@ def test_the_other_effect_of_a_pair_may_come_last():
 def test_simulated_days_raise_few_alarms_and_show_what_should_be_noticed(wander):
     evidence = drives(np.zeros(4))
     scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
-    days = simulated_days(evidence, EFFECTS, SPREAD, wander, scan, draws=400)
+    days = simulated_days(evidence, wander, scan)
     alarms = false_alarms(days, 0.01)
     assert alarms["alarms"] <= 12 and alarms["upper"] >= alarms["rate"]
     curve = [one["noticed"] for one in power_curve(days, 2, np.array([0.3]), 0.01)]
@@ -126,7 +133,7 @@ def test_simulated_days_raise_few_alarms_and_show_what_should_be_noticed(wander)
 def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, monkeypatch):
     evidence = drives(np.zeros(4))
     scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
-    days = simulated_days(evidence, EFFECTS, SPREAD, wander, scan, draws=400)
+    days = simulated_days(evidence, wander, scan)
     monkeypatch.setattr("sysid.pages.loop_report.base_values", lambda _: dict.fromkeys(
         (one.axes[0].parameter for one in EFFECTS), 0.0))
     result = SimpleNamespace(search=SimpleNamespace(scan=scan), evidence=evidence, hypotheses=EFFECTS, full=None,
@@ -135,7 +142,7 @@ def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, mo
     rows = detectable(result, days)
     assert [row["effect"] for row in rows] == [one.effect for one in EFFECTS]
     assert all(0.8 <= row["power"] < 0.85 for row in rows)
-    again = simulated_days(evidence, EFFECTS, SPREAD, wander, scan, draws=400, seed=1)
+    again = simulated_days(evidence, wander, scan, seed=1)
     there = [(one, np.array([row["value"] / EFFECTS[one.hypothesis].axes[0].unit])) for one, row in
              zip(evidence.columns, rows, strict=True)]
     assert again.noticed(0.01, there) == pytest.approx([0.8] * 4, abs=0.1)

@@ -17,8 +17,9 @@ from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
-from sysid.pages.loop_page import not_determined, weights
+from sysid.pages.loop_page import not_determined
 from sysid.pages.loop_report import in_range, unit_of
+from sysid.pages.verdict_picture import account, draw
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import foretold
@@ -183,9 +184,18 @@ def test_a_further_effect_must_gain_more_than_days_differ_by():
 
 
 @pytest.mark.quick
-def test_weights_are_bars_of_names_that_people_use():
-    drawn = weights({"weights": {"noise": 0.2, "quadratic_drag + slope": 0.5, "unknown": 0.3}})
-    assert all(text in drawn for text in ("only the noise", "quadratic drag and slope", "something unknown"))
+def test_the_picture_of_a_verdict_says_of_each_explanation_why_it_is_the_verdict_or_not():
+    effects = ("quadratic_drag", "slope")
+    given = replace(findings(28.0, [tried(8.0, gain=200.0), tried(0.0, effects=effects, gain=280.0, own=(200.0, -1.0)),
+                                    tried(20.0, effects=("wind",), gain=80.0)]), noise=("odometry.v",))
+    shown = account(given, Thresholds())
+    assert {one["name"]: one["outcome"] for one in shown["explanations"]} == {
+        "quadratic drag": "named", "quadratic drag and slope": "is wrong about other manoeuvres",
+        "wind": "explains less", "nothing but other noise": "", "something unknown": ""}
+    assert "two effects stand out" not in shown["looks"]  # pairs were not scanned
+    assert "3. Verdict: named, quadratic drag" in draw(shown)
+    nothing = account(findings(0.1, [], 0.5), Thresholds())
+    assert [one["name"] for one in nothing["explanations"]] == ["nothing"] and "Verdict: none" in draw(nothing)
 
 
 @pytest.mark.quick

@@ -91,10 +91,12 @@ def test_of_an_older_file_the_noise_is_assumed(known):
 
 
 @pytest.mark.long
-def test_the_other_two_uses_name_the_same(known):
-    _, _, plain, sloping = known
-    for references in ((plain,), ()):
-        found = find_missing(sloping, references, CONFIG)
+def test_the_other_uses_name_the_same(known):
+    """Against another day, starting at the preset or at the vehicle of the file, and alone."""
+    file, _, plain, sloping = known
+    start = FittedVehicle(load_fitted(file)[1].params, kept=False)
+    for references, vehicle in (((plain,), None), ((plain,), start), ((), None)):
+        found = find_missing(sloping, references, CONFIG, vehicle)
         assert found.search.verdict == "named" and "slope" in found.search.classes[0]
 
 

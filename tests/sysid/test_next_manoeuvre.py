@@ -24,7 +24,9 @@ from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
 from sysid.missing.drives import make_drives
 from sysid.missing.joint_fit import Refit
 from sysid.pages.loop_page import command_of, sentence
+from sysid.replay.records import FreeVehicle
 from sysid.replay.rollout import vehicle_plant
+from sysid.verdict.result import Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset
 
@@ -57,10 +59,10 @@ def subject():
                                 width=BIN, gyro=False)
     plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
     log = SimpleNamespace(spec=spec, training=(straight_trial(),), name="drives")
-    drives = make_drives(plant, full, names, log.training)
+    drives = make_drives(FreeVehicle(plant, full, names), log.training)
     wander = SimpleNamespace(at=lambda columns, hypothesis, q: np.zeros((len(q), len(q))))
     return SimpleNamespace(log=log, reference=reference, hypotheses=found, full=full, names=names, plant=plant,
-                           drives=drives, prepared=SimpleNamespace(paths=drives.paths, wander=wander))
+                           drives=drives, prepared=Prepared(reference, plant, found, full, names, drives.paths, wander))
 
 
 def fitted(subject, effect, **changes):

@@ -65,9 +65,9 @@ def test_sums_are_those_of_the_residuals_and_their_derivatives(poses, kind, robu
 
 def test_a_search_with_sums_ends_where_one_with_residuals_does(poses, on_accelerator):
     points = least_squares.random_starts(poses.space, 4, seed=2)
-    host = least_squares.fit(dataclasses.replace(poses, replay=Hidden(poses.replay)), poses.space, starts=points,
-                        iterations=25, robust=True)
-    there = least_squares.fit(dataclasses.replace(poses), poses.space, starts=points, iterations=25, robust=True)
+    host = least_squares.fit(dataclasses.replace(poses, replay=Hidden(poses.replay)), starts=points,
+                             stop=least_squares.Stopping(25), robust=True)
+    there = least_squares.fit(dataclasses.replace(poses), starts=points, stop=least_squares.Stopping(25), robust=True)
     assert there.cost == pytest.approx(host.cost, rel=2e-3)
     np.testing.assert_allclose(poses.space.to_values(there.u), TRUTH, rtol=0.1)
     assert there.initial_cost == pytest.approx(host.initial_cost, rel=1e-3)

@@ -89,12 +89,12 @@ def test_pieces_begin_at_the_speeds_that_were_measured(unicycle_log):
 def test_a_search_in_pieces_ends_on_whole_drives(objective, short_pieces, monkeypatch):
     bins = make_features_objective(objective, 0.5)
     points = least_squares.random_starts(UNICYCLE_SPACE, 3, seed=1)
-    expected = from_all(bins, UNICYCLE_SPACE, points, 20)
+    expected = from_all(bins, points, 20)
     assert bins.quicker is bins  # on a processor
     monkeypatch.setattr(bin_objective, "on_processor", lambda: False)
     other = make_features_objective(objective, 0.5)
     assert other.quicker is not other and other.quicker.replay is objective.replay.in_pieces
-    found = from_all(other, UNICYCLE_SPACE, points, 20)
+    found = from_all(other, points, 20)
     assert found.cost == pytest.approx(expected.cost, rel=1e-3)
     np.testing.assert_allclose(UNICYCLE_SPACE.to_values(found.u), TRUTH, rtol=0.1)
     assert found.evaluations > expected.evaluations / 2

@@ -19,7 +19,7 @@ from sysid.search.settings import FitConfig
 
 @pytest.fixture(scope="module")
 def fitted(objective):
-    result = least_squares.fit(objective, objective.space, iterations=15)
+    result = least_squares.fit(objective, stop=least_squares.Stopping(15))
     return result.u, uncertainty.estimate(objective, result.u)
 
 
@@ -46,7 +46,7 @@ def test_the_other_parameters_follow(traced, fitted, objective):
     one = traced[1]
     held = one.others[0]
     start = objective.space.to_unit(np.array([TRUTH[0], held[1], TRUTH[2]]))
-    alone = least_squares.fit(objective, objective.space, starts=start[None], frozen=("tau_omega",), iterations=20)
+    alone = least_squares.fit(objective, starts=start[None], frozen=("tau_omega",), stop=least_squares.Stopping(20))
     assert one.cost[0] == pytest.approx(alone.cost, rel=1e-3)
     unmoved = objective.space.to_values(u)
     unmoved[1] = held[1]

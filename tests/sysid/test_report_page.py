@@ -71,8 +71,9 @@ def run(tmp_path_factory, unicycle_log):
                     "held_out": [t.name for t in unicycle_log.held_out]},
         "settings": {"seed": 0, "physics_dt": 0.02}, "model": {"preset": "toy", "effects": ["lag"]},
         "noise": {"source": "replicates", "scale": {"odometry.v": 0.005}},
-        "parameters": [{"name": "tau_v", "unit": "s", "initial": 0.8, "value": 0.25, "interval": [0.2, 0.3],
-                        "confidence": 0.9, "bounds": [0.02, 1.0], "identifiable": True, "remark": ""},
+        "parameters": [{"name": "tau_v", "meaning": "lag of <v>", "unit": "s", "initial": 0.8, "value": 0.25,
+                        "interval": [0.2, 0.3], "confidence": 0.9, "bounds": [0.02, 1.0], "identifiable": True,
+                        "remark": ""},
                        {"name": "turn", "unit": "-", "initial": 1.1, "value": 0.9, "interval": [0.5, 1.5],
                         "confidence": 0.9, "bounds": [0.5, 1.5], "identifiable": False, "remark": "not told"}],
         "fixed": [{"name": "mass", "value": 52.0, "reason": "weigh it"}], "weak_combinations": ["+1.00 turn"],
@@ -91,7 +92,7 @@ def test_the_page_is_written_from_the_folder_alone_and_links_nothing_outside(run
     text, header = check(page), page.partition("</header>")[0]
     for word in ("Held-out trials: predicted, never fitted", "tau_v", "not told", "weigh it", "a note", "+1.00 turn",
                  "Fisher information", "0.02000", "2 of 3", "figure_eight_1 (held out)",
-                 "sysid sources SHA-256", "toy & <co>"):
+                 "sysid sources SHA-256", "toy & <co>", "lag of <v>"):
         assert word in text, word
     assert '<p class="kind"><span>whill-mjx</span>Fit</p>' in header and '<p class="lead">' in header
     report = read_report(run)

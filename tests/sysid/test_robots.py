@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 
@@ -316,7 +317,7 @@ def test_wheels_that_are_no_cylinders_roll_as_far_as_they_reach(tmp_path):
                for side, y in (("left", 0.2), ("right", -0.2))]
     robot = load_robot(robot_file(tmp_path, *upright))
     assert robot.wheel_radius == pytest.approx(0.099, abs=1e-3) and drives(robot)[0]
-    ball, hub = '<sphere radius="0.02"/>', ""
+    ball, hub = '<sphere radius="0.02"/>', '<sphere radius="0.05"/>'
     rollers = [wheel(f"{side}_wheel", 0, y, hub) + link(f"{side}_roller", ball, 0.01, 1e-5)
                + joint(f"{side}_roller_joint", f"{side}_roller", "0.08 0 0", "continuous", "0 0 1",
                        f"{side}_wheel_link") for side, y in (("left", 0.2), ("right", -0.2))]
@@ -342,6 +343,54 @@ def test_links_that_authors_leave_unfinished_drive_all_the_same(tmp_path, old, n
     path.write_text(path.read_text().replace(old, new))
     robot = load_robot(path)
     assert sum(said in note for note in robot.notes) >= 2 and drives(robot)[0]
+
+
+END = '<limit lower="-3.14" upper="3.14" effort="9" velocity="9"/>'
+WEAK = '<limit effort="0.001" velocity="9"/>'
+
+
+@pytest.mark.parametrize(("change", "straight", "said"), [
+    (lambda text: text.replace('"continuous"', '"revolute"').replace("</joint>", END + "</joint>"), True,
+     "ends at -3.14 and 3.14 rad: a wheel turns on"),
+    (lambda text: text.replace("</joint>", WEAK + "</joint>"), False, "left_wheel_joint gives at most 0.001 N m"),
+    (lambda text: text.replace('ball_joint" type="fixed"', 'ball_joint" type="floating"'), True,
+     "ball_joint is floating: its part is held at 0"),
+    (lambda text: text.replace("<link ", '<link name="world"/><joint name="ground" type="planar"><parent link="world"/>'
+                               '<child link="base"/></joint><link ', 1), True, ""),
+    (lambda text: text.replace("wheel", "mecanum_wheel"), True, "mecanum or omni wheels are taken for plain ones"),
+    (lambda text: text.replace("</robot>", wheel("free_1", 0.3, 0.25) + wheel("free_2", 0.3, -0.25) + "</robot>"), True,
+     "on the spot it reaches only .*: free_._link, free_._link drag sideways"),
+])  # fmt: skip
+def test_what_keeps_a_robot_from_driving_is_mended_or_named(tmp_path, change, straight, said):
+    path = robot_file(tmp_path, *TWO, link("ball", BALL, 0.1, turn="1.5707963 0 0")
+                      + joint("ball_joint", "ball", "-0.2 0 -0.05"))
+    path.write_text(change(path.read_text()))
+    robot = load_robot(path)
+    check = check_robot(robot)
+    assert check.drives_straight == straight
+    assert re.search(said, "\n".join(describe_robot(robot, check)[10:]))
+
+
+def test_wheels_that_are_coupled_are_said_not_to_turn_the_robot(tmp_path):
+    left, right = TWO
+    path = robot_file(tmp_path, left, right.replace("</joint>", '<mimic joint="left_wheel_joint"/></joint>'))
+    robot = load_robot(path)
+    assert any("are coupled (mimic)" in line for line in describe_robot(robot, check_robot(robot)))
+
+
+def test_weight_is_what_a_vehicle_stands_by(tmp_path):
+    from test_models import ROBOT
+
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT.replace("<worldbody>", '<option gravity="0 -9.81 0"/><worldbody>'))
+    with pytest.raises(ValueError, match="option gravity is 0 -9.81 0; .* along -z"):
+        load_robot(path)
+    path.write_text(ROBOT.replace("<body name=", '<body gravcomp="1" name=', 1))
+    robot = load_robot(path)
+    assert not robot.host.body_gravcomp.any() and any("gravcomp" in note for note in robot.notes)
+    with pytest.raises(ValueError, match="begins with <sdf>. Robots are read from URDF"):
+        (tmp_path / "robot.sdf").write_text('<sdf version="1.7"/>')
+        load_robot(tmp_path / "robot.sdf")
 
 
 def test_actuators_that_take_no_speed_are_replaced_and_gears_may_turn_back(tmp_path):

@@ -174,6 +174,7 @@ def path_under_way(effect, command, start):
     import jax.numpy as jnp
 
     from sysid.replay.models import with_surroundings
+    from sysid.replay.records import Plant
     from sysid.replay.rollout import WARM_UP, Commanded, path_of
     from whill_mjx.effects import make_effect
     from whill_mjx.vehicle.types import VehicleParams
@@ -183,8 +184,8 @@ def path_under_way(effect, command, start):
         turn = 0.01 * jnp.stack([v * jnp.cos(state[2]), v * jnp.sin(state[2]), omega])
         return jnp.concatenate([state[:3] + turn, command])
 
-    plant = with_surroundings(lambda params, start: start, moved, lambda state: state,
-                              lambda state, start: state.at[:3].set(start[:3]), 0.01)
+    plant = with_surroundings(Plant(lambda params, start: start, moved, lambda state: state, 0.01,
+                                    lambda state, start: state.at[:3].set(start[:3])))
     params = VehicleParams(None, (make_effect(effect[0], **effect[1]),))
     warm_up = round(WARM_UP / plant.dt)
     return np.asarray(jax.jit(lambda start: path_of(plant, params, Commanded(jnp.asarray(command), start, warm_up)))(

@@ -51,16 +51,15 @@ class TwoValleys:
 @pytest.mark.parametrize(("dear", "cost"), [(10.0, 0.04), (0.01, 1.0)])
 def test_a_search_goes_on_from_far_along_a_range_where_that_costs_little(dear, cost, monkeypatch):
     valleys, start = TwoValleys(4.0), np.full((1, 2), 0.5)
-    space = valleys.space
-    stuck = least_squares.fit(valleys, space, starts=start, iterations=20)
+    stuck = least_squares.fit(valleys, starts=start, stop=least_squares.Stopping(20))
     assert stuck.cost == pytest.approx(1.0, abs=1e-3)
     monkeypatch.setattr("sysid.search.valleys.DEAR", dear)
     monkeypatch.setattr("sysid.search.slopes.ROUNDS", 0)  # nor from close by
-    result, _, _ = gradient_search(valleys, space, start, 20, FitConfig(), None)
+    result, _, _ = gradient_search(valleys, start, 20, FitConfig(), None)
     assert result.cost == pytest.approx(cost, abs=1e-3)
     assert (result.evaluations > stuck.evaluations) == (cost < 1.0)
     np.testing.assert_array_equal(result.starts, stuck.starts)  # the report tells where the given starts ended
-    same, _, _ = gradient_search(valleys, space, start, 20, FitConfig(elsewhere=False), None)
+    same, _, _ = gradient_search(valleys, start, 20, FitConfig(elsewhere=False), None)
     assert same.cost == stuck.cost
 
 
@@ -87,12 +86,12 @@ class NeverMet:
 
 @pytest.mark.quick
 def test_a_limit_that_is_never_met_is_looked_for_inside_its_range():
-    space, start = NeverMet.space, np.array([[0.5, 1.0]])
-    stuck = least_squares.fit(NeverMet(), space, starts=start, iterations=20)
+    start = np.array([[0.5, 1.0]])
+    stuck = least_squares.fit(NeverMet(), starts=start, stop=least_squares.Stopping(20))
     assert stuck.u[1] == 1.0 and stuck.cost > 1.0
     costs, points = least_squares.far_points(NeverMet(), stuck.u)
     assert points[0, 1] < 0.6 and len(costs) == 3  # the limit behind level ground, a smaller gain and a larger one
-    result, _, _ = gradient_search(NeverMet(), space, start, 20, FitConfig(), None)
+    result, _, _ = gradient_search(NeverMet(), start, 20, FitConfig(), None)
     np.testing.assert_allclose(result.u, [0.9, 0.37], atol=1e-3)
 
 
@@ -119,7 +118,7 @@ class Folded:
 def test_averaged_slopes_lead_over_the_folds_of_a_valleys_floor_to_where_it_is_lowest(monkeypatch):
     def ends():
         starts = np.array([[0.9, 0.9], [0.8, 0.2]])
-        return [gradient_search(Folded(), Folded.space, start[None], 40, FitConfig(), None)[0] for start in starts]
+        return [gradient_search(Folded(), start[None], 40, FitConfig(), None)[0] for start in starts]
 
     found, again = ends(), ends()
     assert [one.cost for one in found] == pytest.approx([1.0, 1.0], abs=1e-5)  # no fold beside it costs as little
@@ -151,7 +150,7 @@ class Hidden(Folded):
 def test_ends_of_ranges_are_tried_again_from_the_floor_of_the_valley(rounds, end, cost, monkeypatch):
     monkeypatch.setattr("sysid.search.valleys.DEAR", 0.01)  # far along the ranges lies nothing
     monkeypatch.setattr("sysid.search.slopes.ROUNDS", rounds)
-    found, _, _ = gradient_search(Hidden(), Hidden.space, np.array([[0.9, 0.9, 0.5]]), 40, FitConfig(), None)
+    found, _, _ = gradient_search(Hidden(), np.array([[0.9, 0.9, 0.5]]), 40, FitConfig(), None)
     assert found.u[2] == pytest.approx(end, abs=0.02)
     assert found.cost == pytest.approx(cost, rel=0.1)
 
@@ -183,7 +182,7 @@ def test_a_wrong_start_pose_is_absorbed_only_as_far_as_its_noise_allows(objectiv
 
 def test_lm_reaches_the_noise_floor_from_several_starts(objective):
     starts = least_squares.random_starts(objective.space, 4, seed=1)
-    result = least_squares.fit(objective, objective.space, starts=starts)
+    result = least_squares.fit(objective, starts=starts)
     assert np.ptp(result.start_costs) < 0.01 * result.cost
     assert 0.8 < result.cost < 1.2  # the residual is as large as the spread between replicates
     np.testing.assert_allclose(objective.space.to_values(result.u), TRUTH, rtol=0.05)
@@ -192,13 +191,13 @@ def test_lm_reaches_the_noise_floor_from_several_starts(objective):
 def test_lm_stays_inside_the_bounds_and_finds_a_minimum_on_one(objective):
     space = dataclasses.replace(objective.space, low=np.array([0.02, 0.02, 0.95]), initial=np.array([0.1, 0.1, 1.2]))
     bounded = dataclasses.replace(objective, space=space)
-    result = least_squares.fit(bounded, space)
+    result = least_squares.fit(bounded)
     assert ((result.u >= 0) & (result.u <= 1)).all()
     assert space.to_values(result.u)[2] == pytest.approx(0.95)
 
 
 def test_frozen_parameters_keep_their_value(objective):
-    result = least_squares.fit(objective, objective.space, frozen=("tau_v",), iterations=3)
+    result = least_squares.fit(objective, frozen=("tau_v",), stop=least_squares.Stopping(3))
     assert objective.space.to_values(result.u)[0] == pytest.approx(0.1)
     assert result.cost < result.initial_cost
 
@@ -207,7 +206,7 @@ def test_a_robust_fit_is_not_drawn_by_outliers(objective):
     pose, start = objective.measured.pose.copy(), np.array([[trial.start.yaw] for trial in objective.trials])
     pose[:, ::7, 2] += 0.5 * (pose[:, ::7, 2] - start)  # every seventh yaw is half as far again
     spoiled = dataclasses.replace(objective, measured=dataclasses.replace(objective.measured, pose=pose))
-    errors = [np.abs(least_squares.fit(spoiled, spoiled.space, robust=robust).u - U_TRUTH).max()
+    errors = [np.abs(least_squares.fit(spoiled, robust=robust).u - U_TRUTH).max()
               for robust in (False, True)]
     assert errors[1] < 0.5 * errors[0]
 
@@ -217,7 +216,7 @@ def test_intervals_of_a_robust_fit_are_not_those_of_its_outliers(objective):
     pose = objective.measured.pose.copy()
     pose[:, ::17, 2] += np.where(np.arange(pose[:, ::17].shape[1]) % 2, 0.3, -0.3)
     spoiled = dataclasses.replace(objective, measured=dataclasses.replace(objective.measured, pose=pose))
-    u = least_squares.fit(spoiled, spoiled.space, robust=True).u
+    u = least_squares.fit(spoiled, robust=True).u
 
     def widths(objective, robust):
         known = uncertainty.estimate(objective, u, robust=robust).estimates
@@ -262,7 +261,7 @@ def test_the_papers_cost_is_the_same_where_an_accelerator_sums_it(objective, mon
 
 
 def test_intervals_hold_the_truth_and_are_not_wide(objective):
-    result = least_squares.fit(objective, objective.space)
+    result = least_squares.fit(objective)
     known = uncertainty.estimate(objective, result.u)
     for estimate, truth in zip(known.estimates, TRUTH, strict=True):
         assert estimate.low - 0.02 * truth < truth < estimate.high + 0.02 * truth
@@ -280,7 +279,7 @@ def test_what_the_log_does_not_tell_is_named(objective):
         return values[:2].sum() * np.array([0.3, 0.2, 0.0]) + np.array([0.0, 0.0, 0.9])
 
     blind = dataclasses.replace(objective, replay=Replay(plant, batch, lags), space=space, measured=measured)
-    result = least_squares.fit(blind, space, iterations=8)
+    result = least_squares.fit(blind, stop=least_squares.Stopping(8))
     known = uncertainty.estimate(blind, result.u)
     assert [estimate.identifiable for estimate in known.estimates] == [False, False, False]
     weak = " / ".join(known.weak_combinations())
@@ -293,7 +292,7 @@ def test_a_delay_is_profiled_on_a_grid_and_the_others_follow(objective):
     renamed = dataclasses.replace(objective.space, names=("delay", "tau_omega", "turn"))
     behind = dataclasses.replace(objective, space=renamed)
     off = U_TRUTH + np.array([0.0, 0.1, 0.0])
-    (name, grid, costs, followed), = least_squares.profile_delays(behind, renamed, off)
+    (name, grid, costs, followed), = least_squares.profile_delays(behind, off)
     assert name == "delay" and 16 < len(grid) == len(costs) == len(followed) <= 16 + 2 * 13
     near = np.sort(np.abs(grid - behind.space.to_values(off)[0]))
     assert 0 < near[near > 1e-9].min() < 0.001  # s: finer than a step of the controller's clock
@@ -306,7 +305,7 @@ def test_starts_that_have_converged_are_not_searched_further(objective):
     calls, tried = [], []
 
     class Counted:
-        counted = objective.counted
+        counted, space = objective.counted, objective.space
 
         @staticmethod
         def residuals(u):
@@ -319,7 +318,7 @@ def test_starts_that_have_converged_are_not_searched_further(objective):
             return objective.jacobian(u)
 
     starts = np.array([U_TRUTH, [0.9, 0.9, 0.1]])
-    result = least_squares.fit(Counted(), objective.space, starts=starts, tolerance=1e-3)
+    result = least_squares.fit(Counted(), starts=starts, stop=least_squares.Stopping(tolerance=1e-3))
     assert calls[0] == 2 and calls[-1] == 1
     assert result.evaluations == sum(calls) + sum(tried)
 
@@ -329,7 +328,7 @@ def test_steps_that_bring_what_they_promise_are_followed_without_a_new_jacobian(
     calls = []
 
     class Counted:
-        counted = objective.counted
+        counted, space = objective.counted, objective.space
         residuals = staticmethod(objective.residuals)
 
         @staticmethod
@@ -337,13 +336,13 @@ def test_steps_that_bring_what_they_promise_are_followed_without_a_new_jacobian(
             calls.append(len(u))
             return objective.jacobian(u)
 
-    space, start = objective.space, np.array([[0.2, 0.8, 0.7]])
+    start = np.array([[0.2, 0.8, 0.7]])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(least_squares, "FOLLOWING", 0)
-        plain = least_squares.fit(Counted(), space, starts=start, iterations=20)
+        plain = least_squares.fit(Counted(), starts=start, stop=least_squares.Stopping(20))
         needed, calls[:] = len(calls), []
         assert plain.evaluations == needed * 5
-    quick = least_squares.fit(Counted(), space, starts=start, iterations=20)
+    quick = least_squares.fit(Counted(), starts=start, stop=least_squares.Stopping(20))
     assert len(calls) < needed
     assert quick.cost == pytest.approx(plain.cost, rel=1e-4) and np.abs(quick.u - plain.u).max() < 0.01
     rng = np.random.default_rng(0)
@@ -378,8 +377,8 @@ def test_progress_names_the_stage_of_each_cost(objective):
     """Costs of two stages are of two objectives; each remark says whose it is."""
     said = []
     stages = Stages(lambda count, remark: said.append((count, remark)), 2)
-    least_squares.fit(objective, UNICYCLE_SPACE, iterations=2, progress=stages.begin("whole poses"))
-    gradient_search(objective, UNICYCLE_SPACE, UNICYCLE_SPACE.to_unit(TRUTH)[None], 2,
+    least_squares.fit(objective, stop=least_squares.Stopping(2), progress=stages.begin("whole poses"))
+    gradient_search(objective, UNICYCLE_SPACE.to_unit(TRUTH)[None], 2,
                     FitConfig(elsewhere=False), Stages(lambda count, remark: said.append((count, remark)), 2))
     remarks = [remark for _, remark in said]
     assert remarks[0] == "stage 1 of 2, whole poses" and remarks[1].startswith("stage 1 of 2, whole poses: cost ")

@@ -77,7 +77,7 @@ def test_a_derivative_counts_its_directions_and_recording_takes_no_time(problem)
 
 def test_a_recorded_search_is_the_search_itself(problem, compared):
     points = least_squares.random_starts(problem.space, 2, 0)
-    alone = least_squares.fit(problem.objective, problem.space, starts=points, iterations=14)
+    alone = least_squares.fit(problem.objective, starts=points, stop=least_squares.Stopping(14))
     lm = next(one for one in compared if one.method == "lm")
     assert lm.cost[-1] == pytest.approx(alone.cost, rel=1e-3)
 

@@ -76,7 +76,7 @@ def test_intervals_of_a_rippled_model_hold_the_truth_as_often_as_they_say():
     for _ in range(60):
         design, errors = designs(random), random.standard_normal((DRIVES, SAMPLES))
         rippled = Rippled(design, errors, height=0.05, length=0.05)
-        start = least_squares.fit(rippled, rippled.space, iterations=10)
+        start = least_squares.fit(rippled, stop=least_squares.Stopping(10))
         u = slopes.descend(rippled, start).u
         known = uncertainty.estimate(rippled, u)
         inside.append([one.low <= 0.5 <= one.high for one in known.estimates])
@@ -89,7 +89,7 @@ def test_intervals_of_a_rippled_model_hold_the_truth_as_often_as_they_say():
 def test_a_descent_never_ends_higher_and_counts_what_it_replays():
     random = np.random.default_rng(3)
     rippled = Rippled(designs(random), random.standard_normal((DRIVES, SAMPLES)), height=0.25, length=0.3)
-    start = least_squares.fit(rippled, rippled.space, iterations=10)
+    start = least_squares.fit(rippled, stop=least_squares.Stopping(10))
     told = []
     end = slopes.descend(rippled, start, progress=lambda count, text: told.append(count))
     assert end.cost < start.cost and end.cost == pytest.approx(

@@ -11,7 +11,7 @@ import pytest
 
 from sysid.errors.prior import Prior, bounds_alone
 from sysid.errors.space import Space
-from sysid.intervals.independence import Evidence
+from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import PIECES
 from sysid.logs.log import load_log
 from sysid.pages.report import error_rows, summaries
@@ -65,7 +65,7 @@ def choice(values: tuple[float, ...], groups: np.ndarray, **options):
     parts = jacobian.reshape(len(groups), PIECES, -1, 4)
     scores = np.einsum("bckp,bck->bcp", parts, residual.reshape(len(groups), PIECES, -1))
     prior = bounds_alone(space)
-    evidence = Evidence(u, scores, parts.swapaxes(-1, -2) @ parts, groups, 1.0, 1.0, prior.precision, 1.0)
+    evidence = Information(u, scores, parts.swapaxes(-1, -2) @ parts, groups, 1.0, 1.0, prior.precision, 1.0)
     known = SimpleNamespace(evidence=evidence, deviation=np.sqrt(np.diag(evidence.inverse)))
     found = chosen_sizes(replace(fit, prior=None), fit, known, 1.0, robust=False, **options)
     return found.names, space.to_values(found.u)

@@ -33,10 +33,10 @@ def columns(trial=DRIVE):
             "gx": np.interp(o.t, g.t, g.x), "gy": np.interp(o.t, g.t, g.y), "gyaw": np.interp(o.t, g.t, g.yaw)}
 
 
-def write(path, table, separator=",", header=True, comma=False):
+def write(path, table, separator=",", header=True, comma=False, digits=6):
     """Write columns by name; comma: as the decimal point."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [separator.join(f"{one:.6f}" for one in row) for row in zip(*table.values(), strict=True)]
+    rows = [separator.join(f"{one:.{digits}f}" for one in row) for row in zip(*table.values(), strict=True)]
     rows = [row.replace(".", ",") for row in rows] if comma else rows
     path.write_text("\n".join([separator.join(table)] * header + rows) + "\n")
     return path
@@ -82,6 +82,7 @@ def plotted(c):
     (lambda text: text.replace("gt_x", "odom_x"), "two columns are named 'odom_x'"),
     (lambda text: text.replace("cmd_v", "status"), "is the only part of a command"),
     (lambda text: re.sub(r"(?m)^[\d.]+", "7", text), "time stands still in drive/timestamp"),
+    (lambda text: re.sub(r"(?m)^[\d.]+", "Friday noon", text), "Its timestamp holds 'Friday noon', which is no time"),
 ])  # fmt: skip
 def test_a_table_that_cannot_be_read_is_refused_with_the_reason(tmp_path, change, says):
     path = write(tmp_path / "drive.csv", without_units(columns()))
@@ -113,6 +114,43 @@ def level(c):
                                                                                                  ("w", "cos"))}
     rest = {name: values for name, values in plotted(c).items() if "orientation" not in name and "cmd" not in name}
     return {**rest, **pose, "speed_kmh_cmd": 3.6 * c["cv"], "yawrate_dps_cmd": np.rad2deg(c["cw"])}
+
+
+def days(c):
+    """Dates of a spreadsheet, which count days, and speeds of wheels that are those of their rims."""
+    return {"time": 45000.0 + c["t"] / 86400, "cmd_v": c["cv"], "cmd_w": c["cw"],
+            "left_speed": c["v"] - c["w"] * 0.248, "right_speed": c["v"] + c["w"] * 0.248}
+
+
+def wheels(c):
+    """Minutes, commands and speeds of wheels, and ticks that nobody needs."""
+    rpm = 60 / (2 * np.pi * 0.1325)
+    return {"time_min": c["t"] / 60, "left_rpm_cmd": rpm * (c["cv"] - c["cw"] * 0.248),
+            "right_rpm_cmd": rpm * (c["cv"] + c["cw"] * 0.248), "left_rpm": rpm * (c["v"] - c["w"] * 0.248),
+            "right_rpm": rpm * (c["v"] + c["w"] * 0.248), "battery": 24.0 - c["t"] / 100}
+
+
+@pytest.mark.parametrize("names", [days, wheels])
+def test_wheel_speeds_of_any_unit_are_an_odometry_beside_commands(tmp_path, names):
+    path = write(tmp_path / "drive.csv", names(columns()), digits=12)
+    log, notes = convert(ConvertConfig(path, tmp_path / "log"))
+    assert len(notes) > 1 and ("drive: not used: drive/battery" in notes) == (names is wheels)
+    odometry = log.trials[0].odometry
+    np.testing.assert_allclose(odometry.omega, np.interp(odometry.t, DRIVE.odometry.t, DRIVE.odometry.omega), atol=5e-3)
+    assert log.trials[0].duration == pytest.approx(DRIVE.duration, abs=0.1)
+
+
+def test_ticks_of_wheels_need_their_number_in_a_turn(tmp_path):
+    c = columns()
+    angle = np.cumsum((c["v"] - c["w"] * 0.248) / 0.1325) * np.median(np.diff(c["t"]))
+    ticks = {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"],
+             **{f"{side}_ticks": np.round(angle * 1440 / (2 * np.pi)) for side in ("left", "right")}}
+    path = write(tmp_path / "drive.csv", ticks)
+    with pytest.raises(ValueError, match="say how many make a turn: wheels.left_angle=drive/left_ticks:N/rev"):
+        convert(ConvertConfig(path, tmp_path / "log"))
+    said = tuple(f"wheels.{side}_angle={side}_ticks:1440/rev" for side in ("left", "right"))
+    log, _ = convert(ConvertConfig(path, tmp_path / "log", columns=said))
+    assert log.trials[0].odometry.v.max() == pytest.approx((c["v"] - c["w"] * 0.248).max(), rel=0.1)
 
 
 @pytest.mark.parametrize("names", [with_units, without_units, plotted, level])
@@ -162,6 +200,34 @@ def test_decimal_commas_and_cells_that_are_empty_are_read(tmp_path):
     assert len(log.trials[0].odometry.t) == len(c["t"]) - 1 and any("dead reckoned" in note for note in notes)
 
 
+def test_separators_of_thousands_are_no_decimals(tmp_path):
+    c = columns()
+    path = write(tmp_path / "drive.csv", clocked(c, 1e6 * c["t"]), separator=";", comma=True)
+    head, *rows = path.read_text().splitlines()
+    millions = [f"{round(float(row.split(';')[0].replace(',', '.'))):,}".replace(",", ".") for row in rows]
+    path.write_text("\n".join([head, *(f"{one};{row.partition(';')[2]}"
+                                       for one, row in zip(millions, rows, strict=True))]))
+    log, _ = convert(ConvertConfig(path, tmp_path / "log", columns=("time=time:us",)))
+    check(log.trials[0], pose=False)
+
+
+def test_rows_of_a_rounded_time_are_spread_evenly(tmp_path):
+    c = columns()
+    log, notes = convert(ConvertConfig(write(tmp_path / "drive.csv", clocked(c, np.floor(c["t"]))), tmp_path / "log"))
+    assert any("its time is rounded to 1 s: rows of odometry at one time are spread" in note for note in notes)
+    np.testing.assert_allclose(log.trials[0].odometry.t, c["t"] - c["t"][0], atol=0.11)
+
+
+@pytest.mark.parametrize("order", [("qx", "qy", "qz", "qw"), ("qw", "qx", "qy", "qz")])
+def test_a_trajectory_without_names_may_have_w_first(tmp_path, order):
+    c, parts = columns(), quaternion(columns()["gyaw"])
+    write(tmp_path / "drive" / "cmd.csv", {name: c[key] for name, key in (("t", "t"), ("v", "cv"), ("w", "cw"))})
+    write(tmp_path / "drive" / "mocap.tum", {"t": c["t"], "x": c["gx"], "y": c["gy"], "z": 0 * c["gx"],
+                                             **{name: parts[name] for name in order}}, separator=" ", header=False)
+    log, _ = convert(ConvertConfig(tmp_path / "drive", tmp_path / "log"))
+    np.testing.assert_allclose(np.unwrap(log.trials[0].ground_truth.yaw), np.unwrap(c["gyaw"]), atol=1e-3)
+
+
 def clocked(c, t):
     return {"time": t, "cmd_v": c["cv"], "cmd_w": c["cw"], "odom_v": c["v"], "odom_w": c["w"]}
 
@@ -181,7 +247,8 @@ def test_a_clock_that_was_set_back_is_refused_and_rows_out_of_order_are_not(tmp_
 
 
 @pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f+02:00", "%H:%M:%S.%f",
-                                  "%M:%S.%f"])
+                                  "%M:%S.%f", "%d.%m.%Y %H:%M:%S.%f", "%m/%d/%Y %I:%M:%S.%f %p",
+                                  "%Y/%m/%d/%H:%M:%S.%f"])
 def test_dates_and_times_of_day_are_times_also_past_midnight(tmp_path, form):
     c = columns()
     path = write(tmp_path / "drive.csv", clocked(c, c["t"]))

@@ -9,9 +9,9 @@ import pytest
 from sysid.errors.features import BIN
 from sysid.errors.noise import Whitener
 from sysid.errors.space import make_space
-from sysid.follow_up.tables import Products, Table, few_terms, gains_without, shift
-from sysid.follow_up.terms import Term, columns_of, in_words
-from sysid.follow_up.unnamed import Bench, as_report, fit_unnamed, tables, vehicle_of, with_start_angles
+from sysid.follow_up.unnamed import UnnamedReplays, as_report, fit_unnamed, tables, vehicle_of, with_start_angles
+from sysid.follow_up.wrench_tables import Products, WrenchTable, few_terms, gains_without, shift
+from sysid.follow_up.wrench_terms import Term, columns_of, in_words
 from sysid.logs.manoeuvre_library import make_command
 from sysid.logs.records import OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import base_values
@@ -56,7 +56,7 @@ def bench():
         plant=vehicle_plant(spec, VehicleConfig(physics_dt=0.01)),
         search=SimpleNamespace(base=base, verdict="unexplained", excess=(0.0, 0.0)),
         evidence=SimpleNamespace(groups=tuple((i,) for i in range(len(trials))), precision=400.0 * np.eye(2)))
-    made = Bench(result)
+    made = UnnamedReplays(result)
     slopes = made.drives.linearised(made.values, made.u, np.full(2, 0.02))[1]
     base.jacobian = made.white(made.drives, slopes)
     return made
@@ -65,7 +65,7 @@ def bench():
 def measure(bench, table=None, wrench=None, phases=None, seed=0):
     """Let the drives show a wrench and noise of unit size, and nothing else."""
     count = len(DRIVES)
-    table = table or Table("speed", "push", 0.0, 1.0)
+    table = table or WrenchTable("speed", "push", 0.0, 1.0)
     wrench = np.zeros(2 * KNOTS) if wrench is None else wrench
     nothing = np.zeros(2 * KNOTS)
     phases, still = np.zeros(count, int) if phases is None else phases, np.zeros(count, int)
@@ -79,7 +79,7 @@ def measure(bench, table=None, wrench=None, phases=None, seed=0):
 
 
 def test_friction_that_fades_with_time_is_found_as_such(bench, tmp_path):
-    truth = Table("time in the drive", "brake", 0.0, TIME)
+    truth = WrenchTable("time in the drive", "brake", 0.0, TIME)
     measure(bench, truth, np.concatenate([-40 * np.exp(-truth.knots / 2.5), np.zeros(KNOTS)]))
     found = fit_unnamed(bench)
     assert (found.table.quantity, found.table.kind) == ("time in the drive", "brake") and found.kept
@@ -110,7 +110,7 @@ def test_the_vehicle_of_a_wrench_has_what_a_refit_to_poses_added():
 
 
 def test_a_wheel_out_of_balance_is_found_though_every_drive_starts_at_another_angle(bench):
-    truth = Table("left wheel's angle", "push", 0.0, 1.0)
+    truth = WrenchTable("left wheel's angle", "push", 0.0, 1.0)
     force = 12 * np.sin(ANGLES)
     starts = np.array([3, 17, 8, 22, 12])
     measure(bench, truth, np.concatenate([force, -0.25 * force]), starts)
@@ -125,12 +125,12 @@ def test_a_wheel_out_of_balance_is_found_though_every_drive_starts_at_another_an
 
 
 def test_soft_places_in_the_room_are_fitted_on_a_map(bench, monkeypatch):
-    truth = Table(MAP, "brake", -ROOM, ROOM, -ROOM, ROOM)
+    truth = WrenchTable(MAP, "brake", -ROOM, ROOM, -ROOM, ROOM)
     assert {MAP, "x in the room", "y in the room"} <= {one.quantity for one in tables(bench.result)}
     soft = np.where(truth.knots.prod(-1) > 0, -60.0, 0.0)  # two corners: neither x nor y by itself tells them
     measure(bench, truth, np.concatenate([soft, np.zeros(KNOTS)]))
     monkeypatch.setattr("sysid.follow_up.unnamed.tables", lambda _: [truth])  # five drives are too few to choose by,
-    monkeypatch.setattr("sysid.follow_up.tables.SMOOTHING", (0.01,))  # the smoothing too
+    monkeypatch.setattr("sysid.follow_up.wrench_tables.SMOOTHING", (0.01,))  # the smoothing too
     found = fit_unnamed(bench)
     assert found.cost[1] < 1.1 < 1.3 < found.cost[0] and not found.terms
     assert found.wrench[:KNOTS][soft < 0].mean() < -20 < found.wrench[:KNOTS][soft == 0].mean()
@@ -169,7 +169,7 @@ def products_of(columns, residual, groups=4):
 @quick
 def test_few_terms_stand_for_a_table_that_is_one_and_not_for_one_that_is_none():
     random = np.random.default_rng(1)
-    table = Table("left wheel's angle", "push", 0.0, 1.0)
+    table = WrenchTable("left wheel's angle", "push", 0.0, 1.0)
     columns = random.standard_normal((8, 60, 2 * KNOTS))
     planted = np.concatenate([3 * np.sin(2 * ANGLES + 0.4), np.zeros(KNOTS)])
     rough = np.concatenate([random.choice([-3.0, 3.0], KNOTS), np.zeros(KNOTS)])

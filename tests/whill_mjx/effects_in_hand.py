@@ -30,7 +30,7 @@ def chair(name="whill_cr"):
 def motion_at(v=0.0, omega=0.0, sideways=0.0, yaw=0.0, name="whill_cr"):
     """Motion of a vehicle rolling at v [m/s], omega [rad/s], with a sideways speed added."""
     model, params = chair(name)
-    state = place(model, params, 0.0, 0.0, yaw, v, omega)
+    state = place(model, params, 0.0, 0.0, yaw, (v, omega))
     shift = sideways * jnp.array([-np.sin(yaw), np.cos(yaw)])
     return measure(model, params, nominal_world(model), replace(state, qvel=state.qvel.at[:2].add(shift)))
 

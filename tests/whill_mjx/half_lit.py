@@ -23,7 +23,7 @@ from dreamer.export import flatten_weights, save_arrays
 from dreamer.train import TrainingOptions
 from whill_mjx.io.folders import claim_folder, whole_file
 from whill_mjx.learning.ppo import PpoConfig
-from whill_mjx.learning.ppo_training import train_ppo
+from whill_mjx.learning.ppo_training import Length, train_ppo
 
 TINY = PpoConfig(stack=2, width=32, channels=(8, 8, 8), rollout=16, epochs=4, minibatches=4, lr=3e-3)
 COUNT, ITERATIONS = 4, 40
@@ -86,7 +86,7 @@ def main(options):
             return {"norm": float(jnp.linalg.norm(jax.tree.leaves(params)[-1]))}
 
         how = TrainingOptions(eval_fn=evaluate, eval_every=each, checkpoint_every_s=0.0, progress=False)
-        params, *_ = train_ppo(half_lit_env(COUNT), TINY, options.out, ITERATIONS * each, options.seed, how)
+        params, *_ = train_ppo(half_lit_env(COUNT), TINY, options.out, Length(ITERATIONS * each), options.seed, how)
         with whole_file(options.out / "result.npz") as path:
             save_arrays(path, flatten_weights(params))
 

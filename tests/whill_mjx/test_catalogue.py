@@ -150,7 +150,7 @@ def wide_inputs():
     v, omega, sideways = 0.8 * jnp.sin(0.11 * t + 0.3), 0.7 * jnp.cos(0.17 * t), 0.3 * jnp.sin(0.23 * t)
 
     def one(v, omega, sideways):
-        state = place(model, params, 0.0, 0.0, 0.4, v, omega)
+        state = place(model, params, 0.0, 0.0, 0.4, (v, omega))
         return measure(model, params, nominal_world(model), replace(state, qvel=state.qvel.at[1].add(sideways)))
 
     motions = jax.vmap(one)(v, omega, sideways)

@@ -120,7 +120,7 @@ def test_one_smaller_wheel_rolls_slower_and_the_nominal_radius_stays():
     model, params = chair()
     _, world = make_effect("wheel_radius_difference", difference=0.02, common=-0.01).world((), nominal_world(model))
     np.testing.assert_allclose(world.geometry.wheel_radius, [0.1325, 0.1325 * 0.98], rtol=1e-6)
-    motion = measure(model, params, world, place(model, params, 0.0, 0.0, 0.0, 0.5))
+    motion = measure(model, params, world, place(model, params, 0.0, 0.0, 0.0, (0.5, 0.0)))
     assert motion.wheel_radius == 0.1325
     _, wrench = make_effect("rolling_contact", grip=1.0).force((), motion)
     spin = motion.spin + wrench.spin_torque * DT / motion.wheel_inertia
@@ -136,7 +136,7 @@ def test_one_smaller_wheel_rolls_slower_and_the_nominal_radius_stays():
 def test_a_wider_track_turns_the_wheels_faster_for_the_same_yaw_rate():
     model, params = chair()
     _, world = make_effect("track_width", error=0.05).world((), nominal_world(model))
-    motion = measure(model, params, world, place(model, params, 0.0, 0.0, 0.0, 0.0, 1.0))
+    motion = measure(model, params, world, place(model, params, 0.0, 0.0, 0.0, (0.0, 1.0)))
     np.testing.assert_allclose(motion.contact_vx[1] - motion.contact_vx[0], 0.496 * 1.05, rtol=1e-3)
     assert motion.track == 0.496
 

@@ -34,7 +34,7 @@ def motion_at(v=0.0, omega=0.0, sideways=0.0):
     """Motion of the chair rolling at v [m/s], omega [rad/s] with a sideways speed added."""
     spec, params = preset("whill_cr")
     model = build_model(spec)
-    state = place(model, params, 0.0, 0.0, 0.0, v, omega)
+    state = place(model, params, 0.0, 0.0, 0.0, (v, omega))
     state = state.replace(qvel=state.qvel.at[1].add(sideways))
     return measure(model, params, nominal_world(model), state)
 

@@ -76,7 +76,7 @@ def test_offsets_of_the_centre_of_mass_are_from_the_model_origin_forward_left_an
 
 def test_commands_and_the_evaluated_pose_are_of_the_rear_axle_centre():
     model, params, _ = chair()
-    state = place(model, params, 1.0, 2.0, np.pi / 2, 0.0, 1.0)  # turning on the spot about the axle's centre
+    state = place(model, params, 1.0, 2.0, np.pi / 2, (0.0, 1.0))  # turning on the spot about the axle's centre
     np.testing.assert_allclose(reference_pose(model, state.qpos), [1.0, 2.0, np.pi / 2], atol=1e-5)
     np.testing.assert_allclose(state.qpos[:2], [1.0, 2.0 - model.spec.rear_x], atol=0.01)  # the origin is ahead of it
     np.testing.assert_allclose(state.qvel[:2], [model.spec.rear_x, 0.0], atol=1e-5)

@@ -52,7 +52,7 @@ def test_a_ramp_joins_two_levels_without_a_kerb():
 @quick
 def test_surfaces_at_their_neutral_values_change_no_bit_of_the_motion():
     model, params = chair()
-    state = place(model, params, 0.3, -0.2, 0.8, 0.5, 0.3)
+    state = place(model, params, 0.3, -0.2, 0.8, (0.5, 0.3))
     shake = jnp.array([0.0, 0.1, -0.03, 0.02, 0.05, 0.0, 0.2, -0.1])
     state = state.replace(qvel=state.qvel + shake, qpos=state.qpos.at[3:7].add(jnp.array([0.0, 0.01, -0.02, 0.0])))
     flat = world = nominal_world(model)

@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from whill_mjx.gym import WhillEnv, kinds
+from whill_mjx.gym.kinds import as_actions
 from whill_mjx.gym.vector import WhillVectorEnv
 from whill_mjx.tasks.tasks import TASKS, ObstacleCourse
 
@@ -178,6 +179,34 @@ def test_a_video_is_recorded(tmp_path):
         recorded.step(STILL)
     recorded.close()
     assert list(tmp_path.glob("*.mp4"))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("actions", [None, 0, np.zeros(3), "ab", ["1", "2"], {"a": 1}, object(), [10**400, 0],
+                                     [[0], [0, 0]], np.zeros(2, complex)], ids=str)  # fmt: skip
+def test_actions_that_are_no_numbers_are_refused_in_one_line(actions):
+    with pytest.raises(ValueError, match="^the action .*must be numbers of shape") as refused:
+        as_actions(actions, (2,))
+    assert len(str(refused.value)) < 250
+
+
+@pytest.mark.quick
+def test_a_vector_is_pickled_and_refuses_what_it_cannot_mean():
+    vector = WhillVectorEnv(2, task="point_goal", observations=["goal"], autoreset_mode="Disabled")
+    other = pickle.loads(pickle.dumps(vector))
+    assert other.num_envs == 2 and other.autoreset_mode == vector.autoreset_mode
+    assert other.observation_space == vector.observation_space
+    for seed in ([1], "ab", 1.5, [1, "x"]):
+        with pytest.raises(ValueError, match="^seed is .*it must be a whole number, or a list of 2"):
+            vector.reset(seed=seed)
+    for options in (3, [1], {"reset_mask": [1, 0]}, {"reset_mask": "x"}):
+        with pytest.raises(ValueError, match="options is|reset_mask has"):
+            vector.reset(options=options)
+    for count in (0, True, 1.5, 10**12, "3"):
+        with pytest.raises(ValueError, match="num_envs is"):
+            WhillVectorEnv(count)
+    with pytest.raises(ValueError, match="a pair is a VehicleSpec and its VehicleParams"):
+        WhillVectorEnv(2, vehicle=(1, 2))
 
 
 @pytest.mark.quick

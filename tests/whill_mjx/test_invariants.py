@@ -188,7 +188,7 @@ def test_energy_never_grows_without_input():
         batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *variants)
 
         def one(params):
-            state = place(model, params, 0.0, 0.0, 0.0, 1.0, 0.5)
+            state = place(model, params, 0.0, 0.0, 0.0, (1.0, 0.5))
             state = replace(state, qvel=state.qvel.at[1].add(0.3))
 
             def record(state, command):

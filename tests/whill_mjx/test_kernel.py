@@ -210,7 +210,7 @@ def test_the_assembly_of_a_vehicle_steps_it():
     spec, params = preset("whill_cr_physical")
     model = build_model(spec, VehicleConfig())
     params = jax.tree.map(jnp.asarray, params)
-    state = place(model, params, 0.0, 0.0, 0.3, v=0.5, omega=0.3)
+    state = place(model, params, 0.0, 0.0, 0.3, (0.5, 0.3))
     args = params, state, jnp.array([0.7, -0.2])
     traced = in_pieces(partial(one_step, model), *args)
     numbers = [np.asarray(number).reshape(1) for leaf in jax.tree.leaves(args) for number in np.ravel(leaf)]

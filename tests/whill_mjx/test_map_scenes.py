@@ -126,7 +126,7 @@ def test_a_camera_sees_the_walls_that_all_walls_would_show():
     @jax.vmap
     def wrong(start):
         position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], 0.1, 0.0)
-        few = shown(scene, position, rotation, lens, 64)
+        few = shown(scene, position, rotation, lens)
         row = 32 + jnp.round(jnp.tan(-0.1) * lens.fy).astype(int)  # of the horizon
         one = render_frame(position, rotation, lens, few).depth[row]
         all_of = render_frame(position, rotation, lens, dataclasses.replace(scene, boxes=every, walls=None)).depth[row]

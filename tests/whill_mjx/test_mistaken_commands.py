@@ -104,6 +104,20 @@ def mistaken(command, words, capsys):
     ("evaluate", "planner --task task.py", "--task task.py: a task in a file is named too. Give task.py:CLASS."),
     ("evaluate", "planner --sweep yaw_scrub.nope=1", "no parameter 'nope'"),
     ("evaluate", "planner --sweep body.mass=50,-5", "body.mass is -5"),
+    ("look", "--set layout=fixed", "--set layout=fixed: the layout has an option of its own"),
+    ("look", "--scene corridor --scene docking", "--scene: is given twice"),
+    ("look", "--out data/trials/drive/a.png", "lies among the trials of"),
+    ("drive", "--out data/trials/drive", "lies among the trials of"),
+    ("drive", "--out new --held-out figure_eight", "leaves no manoeuvre to fit"),
+    ("drive", "--out new --noise-levels.position 1", "--noise-levels: has an effect only with --noise"),
+    ("drive", "--out new --effects yaw_scrub:", "no parameter follows the colon"),
+    ("drive", "--out new --effects yaw_scrub:torque=1e300", "torque is 1e+300 N m"),
+    ("view", "training --port 1", "--port: has an effect only with --serve"),
+    ("evaluate", "planner --sweep-episodes 5", "--sweep-episodes: has an effect only with --sweep"),
+    ("evaluate", "planner --baselines planner", "--baselines planner: is given twice"),
+    ("evaluate", "planner --baselines ../x=random", "a name is letters, digits"),
+    ("evaluate", "planner --blind blank", "planner does not look at images"),
+    ("evaluate", "planner --sweep vehicle=husky,husky", "husky: is given twice"),
     ("evaluate", "planner --sweep light=1,1", "a value is there twice"),
     ("evaluate", "planner --baselines a=planner a=random", "--baselines a: is given twice"),
     ("drive", "--out new --effects yaw_scrub:torque=1 yaw_scrub:torque=2", "--effects yaw_scrub: is given twice"),
@@ -126,6 +140,8 @@ def test_a_mistake_ends_with_one_line_and_code_2(command, words, told, tmp_path,
     (tmp_path / "mine" / "report.html").write_text("mine")
     (tmp_path / "training").mkdir()
     (tmp_path / "training" / "run.json").write_text('{"kind": "whill_mjx.train", "identity": {"seed": 0}}')
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "dataset.toml").write_text("")
     before = sorted(tmp_path.rglob("*"))
     code, line = mistaken(command, words, capsys)
     assert told in line and code == command_line.REFUSED

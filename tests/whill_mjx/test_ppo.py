@@ -25,7 +25,7 @@ from whill_mjx.learning.ppo import (
     push,
     track,
 )
-from whill_mjx.learning.ppo_training import train_ppo
+from whill_mjx.learning.ppo_training import Length, train_ppo
 
 QUIET = TrainingOptions(progress=False)
 
@@ -138,7 +138,7 @@ def test_an_evaluation_made_ahead_is_compiled_when_it_is_due(tmp_path):
 
     each = 4 * TINY.rollout
     ahead = lambda params: evaluate(params, 0)  # noqa: E731
-    train_ppo(env, TINY, tmp_path, 2 * each, 0, TrainingOptions(evaluate, ahead, each, progress=False))
+    train_ppo(env, TINY, tmp_path, Length(2 * each), 0, TrainingOptions(evaluate, ahead, each, progress=False))
     assert len(traced) == 1 and asked == [0, each, 2 * each]
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["env_steps"] for row in rows] == asked[1:] and all("eval/spread" in row for row in rows)
@@ -148,7 +148,7 @@ def test_another_seed_and_more_steps_run_the_programs_that_were_kept(tmp_path, p
     env, each = half_lit_env(4), 4 * TINY.rollout
     for seed, steps in ((0, 2 * each), (1, 3 * each)):
         programs.clear()
-        train_ppo(env, TINY, tmp_path / str(seed), steps, seed, QUIET)
+        train_ppo(env, TINY, tmp_path / str(seed), Length(steps), seed, QUIET)
     assert programs["cache_misses"] == 0 and programs["cache_hits"] >= 2
 
 
@@ -159,7 +159,7 @@ def test_an_interrupted_baseline_goes_on_to_the_bits_of_an_uninterrupted_one(tmp
         def figures(params, env_steps):
             return {"norm": float(jnp.linalg.norm(jax.tree.leaves(params)[-1]))}
 
-        return train_ppo(env, TINY, tmp_path / out, 6 * each, 0,
+        return train_ppo(env, TINY, tmp_path / out, Length(6 * each), 0,
                          TrainingOptions(figures, eval_every=each, stop=stop, checkpoint_every_s=60.0, progress=False))
 
     def lines(out):
@@ -187,13 +187,13 @@ def test_another_setting_of_the_baseline_is_refused_on_resuming(tmp_path):
     from dreamer.checkpoint import CheckpointError
 
     env, each = half_lit_env(4), 4 * TINY.rollout
-    train_ppo(env, TINY, tmp_path, each, 0, QUIET)
+    train_ppo(env, TINY, tmp_path, Length(each), 0, QUIET)
     with pytest.raises(CheckpointError, match="lr: saved 0.003, now 0.1"):
-        train_ppo(env, dataclasses.replace(TINY, lr=0.1), tmp_path, 2 * each, 0, QUIET)
+        train_ppo(env, dataclasses.replace(TINY, lr=0.1), tmp_path, Length(2 * each), 0, QUIET)
 
 
 @pytest.mark.quick
 @pytest.mark.parametrize("wrong", [{"lr": float("nan")}, {"lr": 0.0}, {"discount": 1.5}, {"entropy_scale": -1.0}])
 def test_settings_that_cannot_be_meant_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"PpoConfig.{next(iter(wrong))} = .* must"):
+    with pytest.raises(ValueError, match=f"PpoConfig: {next(iter(wrong))} is .*; it must"):
         PpoConfig(**wrong)

@@ -17,7 +17,7 @@ EYE = jnp.array([0.0, 0.0, 1.0])
 LEVEL = jnp.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along +x
 LENS = pinhole(1.2)
 RED = jnp.array([1.0, 0.0, 0.0])
-frame = jax.jit(render_frame, static_argnums=(4, 5))
+frame = jax.jit(render_frame)
 
 
 def scene_of(*boxes, marker_x=-50.0):
@@ -135,7 +135,7 @@ def test_a_pose_that_is_not_finite_gives_a_black_image():
 
 
 def test_images_of_other_sizes_keep_the_view():
-    wide = frame(EYE, LEVEL, pinhole(1.2, 32, 48), scene_of(box(3.0, 0.0, 1.0, 1.0, 2.0, RED)), 32, 48).rgb
+    wide = frame(EYE, LEVEL, pinhole(1.2, 32, 48), scene_of(box(3.0, 0.0, 1.0, 1.0, 2.0, RED))).rgb
     assert wide.shape == (32, 48, 3) and wide[16, 24, 0] > 100 and wide[16, 24, 1] < 20
 
 

@@ -99,7 +99,7 @@ def test_strips_that_keep_enough_boxes_change_nothing():
 @pytest.mark.parametrize("height, width", [(1, 1), (7, 40), (200, 96), (1024, 1024)])
 def test_every_size_and_zero_boxes_give_an_image(height, width):
     scene = dataclasses.replace(scene_of(), boxes=no_boxes(0))
-    image = jax.jit(lambda s: render(EYE, LEVEL, pinhole(1.2, height, width), s, height, width))(scene)
+    image = jax.jit(lambda s: render(EYE, LEVEL, pinhole(1.2, height, width), s))(scene)
     assert image.shape == (height, width, 3) and np.asarray(image).any()
 
 
@@ -148,7 +148,7 @@ def test_the_smooth_image_has_the_derivatives_of_finite_differences_and_finds_a_
     scene = scene_of(*boxes)
 
     def image(x):
-        return render_soft(x[:3], camera_rotation(x[3], x[4], x[5]), pinhole(1.2, 24, 24), scene, 24, 24)[0]
+        return render_soft(x[:3], camera_rotation(x[3], x[4], x[5]), pinhole(1.2, 24, 24), scene)[0]
 
     truth = jnp.array([0.0, 0.0, 0.8, 0.05, 0.15, 0.0])  # no face is seen edge-on: there the image has a kink
     draw, slope = jax.jit(image), jax.jit(jax.jacfwd(image))

@@ -129,7 +129,7 @@ def test_silhouettes_and_depth_are_those_of_mujoco(mujoco_frames, kind, pose):
     rotation = ROTATIONS[pose]
     scene, _ = scene_and_xml(kind)
     picture, depth, geom = (mujoco_frames[f"{kind} {pose} {what}"] for what in ("image", "depth", "geom"))
-    draw = jax.jit(lambda s, turn: render_frame(jnp.asarray(EYE), turn, pinhole(FOV, SIZE, SIZE), s, SIZE, SIZE))
+    draw = jax.jit(lambda s, turn: render_frame(jnp.asarray(EYE), turn, pinhole(FOV, SIZE, SIZE), s))
     frame = draw(scene, rotation)
     PICTURES[f"{kind} {pose}"] = np.hstack([np.asarray(frame.rgb), picture])
     label = np.asarray(frame.label).astype(int)

@@ -20,6 +20,7 @@ from whill_mjx.world.solids import Solids, block, person, post, stack_rounds
 
 EYE, TURN = jnp.array([0.0, 0.1, 1.0]), camera_rotation(0.1, 0.15, 0.05)
 BEST = Quality(antialias=True, shadows=True)
+TILING = Tiling()
 DISTORTED = dataclasses.replace(pinhole(1.2, 32, 32), distortion=jnp.array([-0.2, 0.05, 0.001, 0.0, 0.0]))
 
 
@@ -57,9 +58,13 @@ def unfinished(count=6):
     return dataclasses.replace(furnished(count), finish=None)
 
 
-def both(scene, lens, quality, tiling, size=32):
-    one = jax.jit(lambda s: render(EYE, TURN, lens, s, size, size, quality))(scene)
-    other = jax.jit(lambda s: render_pallas(EYE, TURN, lens, s, size, size, quality, tiling, interpret=True))(scene)
+def interpreted(tiling=TILING):
+    return dataclasses.replace(tiling, interpret=True)
+
+
+def both(scene, lens, quality, tiling):
+    one = jax.jit(lambda s: render(EYE, TURN, lens, s, quality))(scene)
+    other = jax.jit(lambda s: render_pallas(EYE, TURN, lens, s, quality, interpreted(tiling)))(scene)
     return np.abs(np.asarray(one).astype(int) - np.asarray(other)).max(-1), np.asarray(one)
 
 
@@ -84,7 +89,7 @@ def test_order_of_the_primitives_does_not_change_the_image():
     scene, lens = crowd(70), pinhole(1.2, 16, 16)
 
     def draw(tiling):
-        kernel = partial(render_pallas, height=16, width=16, tiling=tiling, interpret=True)
+        kernel = partial(render_pallas, tiling=interpreted(tiling))
         return np.asarray(jax.jit(lambda s: kernel(EYE, TURN, lens, s))(scene))
 
     images = [draw(Tiling(8, 8, sort=sort)) for sort in (True, False)]
@@ -94,8 +99,8 @@ def test_order_of_the_primitives_does_not_change_the_image():
 
 def test_kernel_draws_sizes_that_tiles_do_not_divide():
     scene, lens = crowd(5), pinhole(1.0, 20, 28)
-    one = jax.jit(lambda s: render(EYE, TURN, lens, s, 20, 28))(scene)
-    other = jax.jit(lambda s: render_pallas(EYE, TURN, lens, s, 20, 28, interpret=True))(scene)
+    one = jax.jit(lambda s: render(EYE, TURN, lens, s))(scene)
+    other = jax.jit(lambda s: render_pallas(EYE, TURN, lens, s, tiling=interpreted()))(scene)
     assert other.shape == (20, 28, 3)
     assert (np.abs(np.asarray(one).astype(int) - np.asarray(other)) > 1).mean() < 5e-3
 
@@ -104,9 +109,9 @@ def test_a_batch_of_kernels_equals_single_ones_and_bad_poses_are_black():
     scenes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), crowd(4))
     eyes = jnp.stack([EYE, EYE.at[0].set(jnp.nan)])
     lens = pinhole(1.2, 16, 16)
-    draw = jax.jit(jax.vmap(lambda p, s: render_pallas(p, TURN, lens, s, 16, 16, interpret=True)))
+    draw = jax.jit(jax.vmap(lambda p, s: render_pallas(p, TURN, lens, s, tiling=interpreted())))
     images = np.asarray(draw(eyes, scenes))
-    single = np.asarray(jax.jit(lambda s: render(EYE, TURN, lens, s, 16, 16))(crowd(4)))
+    single = np.asarray(jax.jit(lambda s: render(EYE, TURN, lens, s))(crowd(4)))
     assert (np.abs(images[0].astype(int) - single) > 1).mean() < 5e-3 and images[0].std() > 10
     assert not images[1].any()
 
@@ -118,7 +123,7 @@ def test_a_batch_of_kernels_equals_single_ones_and_bad_poses_are_black():
 )
 def test_kernel_lowers_for_cuda(scene, quality):
     scenes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((4, *leaf.shape), leaf.dtype), scene)
-    draw = jax.jit(jax.vmap(lambda s: render_pallas(EYE, TURN, DISTORTED, s, 32, 32, quality)))
+    draw = jax.jit(jax.vmap(lambda s: render_pallas(EYE, TURN, DISTORTED, s, quality)))
     device = AbstractDevice("NVIDIA H200", None, "cuda")  # newer versions of JAX ask for one
     with use_abstract_mesh(AbstractMesh((1,), ("one",), (AxisType.Auto,), abstract_device=device)):
         assert "triton" in draw.trace(scenes).lower(lowering_platforms=("cuda",)).as_text()
@@ -142,11 +147,11 @@ def test_an_image_is_drawn_by_the_kernel_on_nvidia_gpus_and_by_plain_jax_elsewhe
     scene, lens = crowd(5), pinhole(1.0, 16, 16)
 
     def picture(scene):
-        return draw(EYE, TURN, lens, scene, 16, 16)
+        return draw(EYE, TURN, lens, scene)
 
     assert "platform_index" not in str(jax.make_jaxpr(picture)(scene))  # no GPU: nothing of the kernel is traced
     monkeypatch.setattr("whill_mjx.world.render.draw.runs_triton", lambda: True)
-    expected = jax.jit(lambda s: render(EYE, TURN, lens, s, 16, 16))(scene)
+    expected = jax.jit(lambda s: render(EYE, TURN, lens, s))(scene)
     np.testing.assert_array_equal(jax.jit(picture)(scene), expected)
     device = AbstractDevice("NVIDIA H200", None, "cuda")
     with use_abstract_mesh(AbstractMesh((1,), ("one",), (AxisType.Auto,), abstract_device=device)):
@@ -158,7 +163,7 @@ def test_what_is_computed_beside_an_image_keeps_its_derivative(monkeypatch):
     scene, lens = crowd(5), pinhole(1.0, 16, 16)
 
     def height_and_image(eye):
-        return eye[2] ** 2, draw(eye, TURN, lens, scene, 16, 16)
+        return eye[2] ** 2, draw(eye, TURN, lens, scene)
 
     gradient, _ = jax.jit(jax.grad(height_and_image, has_aux=True))(EYE)
     np.testing.assert_allclose(gradient, [0, 0, 2 * EYE[2]])

@@ -82,9 +82,9 @@ def test_things_never_close_the_passage(task):
 def test_the_kernel_draws_rich_looks_as_the_renderer_does():
     scene = paint(jax.random.key(1), furnished("corridor", jax.random.key(2)))
     pose = jnp.array([0.5, 0.0, 0.68]), camera_rotation(0.1, 0.15)
-    ours = jax.jit(lambda scene: render(*pose, pinhole(1.2, SIZE, SIZE), scene, SIZE, SIZE))(scene)
-    kernel = jax.jit(lambda scene: render_pallas(*pose, pinhole(1.2, SIZE, SIZE), scene, SIZE, SIZE,
-                                                 tiling=Tiling(SIZE, SIZE), interpret=True))(scene)  # fmt: skip
+    ours = jax.jit(lambda scene: render(*pose, pinhole(1.2, SIZE, SIZE), scene))(scene)
+    kernel = jax.jit(lambda scene: render_pallas(*pose, pinhole(1.2, SIZE, SIZE), scene,
+                                                 tiling=Tiling(SIZE, SIZE, interpret=True)))(scene)  # fmt: skip
     assert RICH.antialias and np.abs(np.asarray(ours, int) - kernel).max() <= 1
     assert np.std(ours) > 5
 

@@ -19,6 +19,7 @@ from whill_mjx.env import make_env, reset_state, step_state
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.registry import Registry
 from whill_mjx.learning.setup import find_preset
+from whill_mjx.sensors.base import Reading, Sensor
 from whill_mjx.tasks import tasks
 from whill_mjx.tasks.base import Budget, Task
 from whill_mjx.tasks.corridor import Corridor
@@ -137,6 +138,11 @@ class Mine(Task):
     ("rewards(self, moment): return {'a': np.exp(moment.goal_distance)}", "jax.numpy for numpy"),
     ("endings(self, moment): return {'success': moment.goal_distance}", "'success' is float32"),
     ("endings(self, moment): pass", "endings: returns NoneType"),
+    ("rewards(self, moment): return {}", "rewards: returns an empty dict"),
+    ("rewards(self, moment): return {1: moment.time_s}", "rewards: has the name 1; it must be a text"),
+    ("rewards(self, moment): raise SystemExit(0)", "rewards, line 10: SystemExit"),
+    ("observations(self): return None", "observations: TypeError"),
+    ("observations(self): return ['nope']", "observations: ValueError: unknown sensor 'nope'"),
     ("goal(self, scene): return 1.0", "goal: returns .*array .2,."),
     ("reward(self, moment): return {}", "'reward' is never called; 'rewards' would be"),
 ])  # fmt: skip
@@ -153,6 +159,13 @@ def test_a_method_that_cannot_work_is_named_before_anything_is_compiled(method, 
 @pytest.mark.quick
 @pytest.mark.parametrize(("body", "said"), [
     ("    bay: list = None\n    def __post_init__(self): object.__setattr__(self, 'bay', [])", "unhashable"),
+    ("    name = 'a b'", "its name is 'a b'; it must be letters"), ("    name = 3", "its name is 3"),
+    ("    name = 'corridor'", "it is called 'corridor', as one of whill_mjx"),
+    ("    budgets = 3", "budgets is 3; it must be a dict of Budgets"),
+    ("    sweeps = 3", "sweeps is 3; it must be a tuple"),
+    ("    def __post_init__(self): raise KeyError('x')", "KeyError: 'x'"),
+    ("    def __post_init__(self): raise SystemExit(0)", "SystemExit: 0"),
+    ("    import sys; sys.exit(0)", "SystemExit: 0"),
     ("    bay: float = field(kw_only=True)", "missing 1 required keyword-only argument: 'bay'"),
 ])
 def test_a_task_that_cannot_be_made_is_one_line(body, said, tmp_path):
@@ -168,6 +181,44 @@ def test_a_budget_of_no_preset_or_of_no_kind_is_refused(budgets):
     kind = type("Mistaken", (Task,), {"budgets": budgets})
     with pytest.raises(ValueError, match="budgets has 'smok"):
         find_preset("smoke", dataclass(frozen=True)(kind)())
+
+
+SENSOR = """
+@dataclass(frozen=True)
+class Own(Sensor):
+    def begin(self, view): return jnp.zeros(1)
+    def reading(self, env): {reading}
+    def measure(self, memory, view, key): {measure}
+"""
+SHAPE, VALUE = "return Reading((2,))", "return memory, view.moment.pose[:2]"
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("reading", "measure", "said"), [
+    (SHAPE, "return memory, view.moment.pose", "measured .3,., but its reading says .2,."),
+    (SHAPE, "return view.moment.pose[:2]", "it must be the pair"),
+    (SHAPE, "return None", "measure returns NoneType; it must be the pair"),
+    (SHAPE, "return (), view.moment.pose[:2]", "both must be alike"),
+    (SHAPE, "raise KeyError('x')", "KeyError: 'x'"), (SHAPE, "raise SystemExit(0)", "SystemExit: 0"),
+    ("return None", VALUE, "reading returns NoneType; it must be a Reading"), ("return Reading((-1,))", VALUE, "shape"),
+    ("return Reading((2,), low=5, high=-5)", VALUE, "the lower bound"), ("raise KeyError('x')", VALUE, "KeyError"),
+    ("return Reading((10**12,))", VALUE, "at most 100000000"), ("return Reading((2,), dtype='x')", VALUE, "TypeError"),
+])  # fmt: skip
+def test_a_sensor_that_cannot_work_is_named_before_anything_is_compiled(reading, measure, said):
+    found = {"Sensor": Sensor, "Reading": Reading, "dataclass": dataclass, "jnp": jnp, "__name__": "mine"}
+    exec(SENSOR.format(reading=reading, measure=measure), found)
+    with pytest.raises(ValueError, match=f"^sensor 's', Own: .*{said}") as caught:
+        make_env("corridor", observations={"s": found["Own"]()})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.quick
+def test_a_reward_that_is_no_number_ends_the_episode_as_diverged_and_counts_nothing():
+    kind = type("Broken", (Task,), {"rewards": lambda self, moment: {"a": moment.time_s * jnp.nan}})
+    env, params = make_env(dataclass(frozen=True)(kind)())
+    state = jax.jit(lambda key: reset_state(env, params, key))(jax.random.key(0))
+    _, outcome = jax.jit(lambda state: step_state(env, params, state, jnp.zeros(2)))(state)
+    assert outcome.reward == 0 and outcome.terminated and outcome.metrics["diverged"] == 1
 
 
 @dataclass(frozen=True)
@@ -228,10 +279,8 @@ def test_an_ending_with_a_name_of_the_library_is_refused():
         def endings(self, moment):
             return {"timeout": moment.time_s > 1.0}
 
-    env, params = make_env(Late())
     with pytest.raises(ValueError, match="ending 'timeout' is the library's own"):
-        jax.eval_shape(lambda key: step_state(env, params, reset_state(env, params, key), jnp.zeros(2)),
-                       jax.random.key(0))  # fmt: skip
+        make_env(Late())
 
 
 @pytest.mark.quick

@@ -315,7 +315,21 @@ def test_a_folder_with_somebodys_files_is_refused_before_the_training(tmp_path, 
     ("--task nope", r"--task nope: unknown \(known: among_people, corridor, .*obstacle_course.*\)"),
     ("--preset nope", "--preset nope: unknown"), ("--safety nope", "--safety nope: unknown"),
     ("--vehicle nope", "unknown vehicle 'nope'.*whill_cr_paper"), ("--change lr=NaN", "lr=NaN"),
-    ("--change batch_size=0", "batch_size = 0: it must be at least 1"), ("--change nope=1", "changes no setting"),
+    ("--change batch_size=0", "batch_size = 0: it must be a whole number in 1"),
+    ("--change batch_size=9999999999999", "batch_size = 9999999999999: it must"),
+    ("--change batch_size=true", "batch_size = True"),
+    ("--change min_std=2", "min_std = 2: it must be at most max_std"),
+    ("--change batch_size=1000000 batch_length=1000", r"GB, .* for batch_size \(1000000\) x batch_length \(1000\)"),
+    ("--instances 10000000 --change replay_capacity=1", r"GB, .* for instances \(10000000\)"),
+    ("--learner ppo --change rollout=1000000", r"GB, .* for rollout \(1000000\)"),
+    ("--learner ppo --change lr=true", "PpoConfig: lr is True"),
+    ("--learner ppo --targets", "--targets: has an effect only with --learner dreamer"),
+    ("--learner ppo --train-ratio 5", "--train-ratio: has an effect only with --learner dreamer"),
+    ("--steps 5 --steps 6", "--steps: is given twice"), ("--planner --no-planner", "--no-planner: is given twice"),
+    ("--set gates=1 --set goal_x=3", "--set: is given twice"), ("--vehicle ~/vehicle.toml", "put your home folder"),
+    ("--set layout=fixed", "the layout has an option of its own"), ("--episodes 10000000", "--episodes 10000000"),
+    ("--task :X", "is no name of a task"), ("--task ..a:X", "is no name of a task"),
+    ("--change nope=1", "changes no setting"),
     ("--change mults=3", "give a finite value like it"), ("--log nowhere", "--log nowhere: no such dataset"),
     ("--log Makefile", "Makefile: "), ("--change lr=0.1 lr=0.2", "lr is given twice"),
     ("--steps 99999999999999999999", "at most 1000000000000"),
@@ -323,7 +337,8 @@ def test_a_folder_with_somebodys_files_is_refused_before_the_training(tmp_path, 
     ("--learner ppo --instances 3 --change minibatches=7", "split"),
 ])  # fmt: skip
 def test_a_mistake_in_the_command_ends_with_one_line_and_writes_nothing(words, told, tmp_path, capsys):
-    command = ["--preset", "smoke", "--out", str(tmp_path / "run"), *words.split()]
+    preset = [] if "--preset" in words else ["--preset", "smoke"]
+    command = [*preset, "--out", str(tmp_path / "run"), *words.split()]
     with pytest.raises(SystemExit, match=f"error: .*{told}") as ended:
         command_line.run(TrainOptions, main, None, args=command)
     assert ended.value.code == command_line.REFUSED and capsys.readouterr().err.count("\n") == 1
@@ -403,13 +418,13 @@ def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
 
 @pytest.mark.quick
 def test_any_setting_of_the_learner_can_be_changed_and_a_wrong_one_is_refused_by_name():
-    asked = TrainOptions(preset="cpu", change=("greedy_share=0.25", "mults=[1, 2]", "mirror=true"))
+    asked = TrainOptions(preset="cpu", change=("greedy_share=0.25", "mults=[1, 2]", "online=false"))
     learner = choose_preset(asked).learner
-    assert learner.greedy_share == 0.25 and learner.mults == (1, 2) and learner.mirror is True
+    assert learner.greedy_share == 0.25 and learner.mults == (1, 2) and learner.online is False
     preset = choose_preset(TrainOptions(preset="cpu", learner="ppo", change=("discount=0.9",)))
     assert preset.ppo.discount == 0.9
     for wrong, told in (("greedy=1", "greedy_share"), ("greedy_share=a", "JSON"), ("greedy_share", "JSON"),
-                        ("greedy_share=2", "must lie in")):
+                        ("greedy_share=2", "must be a number in 0..1")):
         with pytest.raises(ValueError, match=told):
             choose_preset(TrainOptions(preset="cpu", change=(wrong,)))
 

@@ -112,6 +112,20 @@ def test_a_proposed_drive_is_known_by_its_page_alone(tmp_path):
     assert (run.kind, run.state, run.sentence) == ("next drive", "finished", "Drive chirp next.")
 
 
+def test_runs_are_shown_beside_the_page_of_a_proposed_drive(tmp_path):
+    (tmp_path / "command.html").write_text('<p class="lead">Drive chirp next.</p>')
+    finished(tmp_path / "train")
+    assert find_runs([tmp_path]) == [tmp_path / "train", tmp_path]
+    assert find_runs([tmp_path / "train"]) == [tmp_path / "train"]
+
+
+@pytest.mark.parametrize("values", [[0.0, 0.0], [1.0, 1.0], [-13.6301, -13.6304], [1e-5, 2e-5]])
+def test_ticks_of_a_chart_have_labels_that_differ(values):
+    chart = line_chart([Line(np.arange(2.0), np.array(values))], "x", "y")
+    labels = re.findall(r'text-anchor="end">([^<]*)<', chart)
+    assert len(labels) > 2 and len(set(labels)) == len(labels)
+
+
 def test_the_page_needs_nothing_but_itself(tmp_path):
     page = page_of(finished(tmp_path / "train"), fit(tmp_path / "fit"))
     parsed = Tags(page)

@@ -90,7 +90,8 @@ def runs_page(runs: Sequence[Run], links: Links, embed: int = MEDIA_BYTES, head:
     sections.append(html.Section("Settings", settings(runs)))
     title = runs[0].name if len(runs) == 1 else f"{len(runs)} runs"
     policy = f'<meta http-equiv="Content-Security-Policy" content="{escaping.escape(POLICY)}">'
-    return html.html_page(title, sections, kind="Runs", lead=meaning(runs), head=head or policy)
+    page = html.html_page(title, sections, kind="Runs", lead=meaning(runs), head=head or policy)
+    return page.encode("utf-8", "replace").decode()  # JSON has letters that no text file can hold
 
 
 def meaning(runs: Sequence[Run]) -> str:
@@ -141,7 +142,8 @@ def _chart(runs: Sequence[Run], name: str, title: str) -> str:
         x, y = curve(run.lines, name)
         if len(x):
             lines.append(Line(x, y, "", _colour(k), markers=len(x) < (40 if name.startswith("eval/") else 3)))
-    return line_chart(lines, "environment steps", "", title, Axes(width=340, height=230)) if lines else ""
+    share = (0.0, 1.0) if name.partition("/")[2] in ("success", "collision") else ()
+    return line_chart(lines, "environment steps", "", title, Axes(340, 230, covers=share)) if lines else ""
 
 
 def _colour(index: int) -> str:

@@ -75,7 +75,9 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if not path.is_dir():
             raise FileNotFoundError(f"RUN {path}: no such folder. Correct the path.")
-        inside = [path] if is_run(path) else sorted(one for one in path.iterdir() if one.is_dir() and is_run(one))
+        inside = [] if (path / RUN_FILE).exists() else sorted(
+            one for one in path.iterdir() if one.is_dir() and is_run(one))
+        inside += [path] if is_run(path) else []  # beside its runs, a folder may hold the page of a proposed drive
         if not inside:
             raise FileNotFoundError(f"RUN {path}: holds no run. Give the folder that a command wrote by --out.")
         found |= {one.resolve(): one for one in inside}
@@ -307,7 +309,7 @@ def _sentence(
             return _progress(state, about, lines)
         if kind == "evaluation" and result:
             name, first = next(iter(result["drivers"].items()))
-            return f"{name} succeeds in {first['success']:.1%} of {first['episodes']} episodes."
+            return f"{name.capitalize()} succeeds in {first['success']:.1%} of {first['episodes']} episodes."
         if kind == "missing effect" and result:
             return f"{result['verdict'].capitalize()}: {result['reason']}."
         if result:

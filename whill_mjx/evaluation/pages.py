@@ -69,7 +69,7 @@ def _scale_bar(axes: Any, metres: float = 1.0) -> None:
     """Draw a bar of this length in the lower left corner."""
     x, y = axes.get_xlim()[0] + 0.15, axes.get_ylim()[0] + 0.15
     axes.plot([x, x + metres], [y, y], "-", color="black", linewidth=2, solid_capstyle="butt")
-    axes.text(x + metres / 2, y + 0.08, f"{metres:g} m", ha="center", va="bottom", fontsize=6)
+    axes.text(x + metres + 0.08, y, f"{metres:g} m", va="center", fontsize=6)
 
 
 def _legend(figure: Any, endings: set[str], columns: int) -> None:
@@ -81,7 +81,7 @@ def _legend(figure: Any, endings: set[str], columns: int) -> None:
                           for how, colour in ENDINGS.items() if how in endings]  # fmt: skip
     handles += [
         Line2D([], [], color="grey", marker="o", linestyle="", markersize=4,
-               label="end of the drive axle; the body is longer"),
+               label="last position of the drive axle; the body reaches further"),
         Line2D([], [], color="tab:blue", marker="s", linestyle=":", markersize=4, label="goal and its region"),
         Patch(color="grey", label="boxes and walls, in their colours"),
     ]
@@ -218,11 +218,20 @@ def page(evaluation: dict[str, Any], pictures: list[Path], videos: list[Path], o
     subtitle = f"{first['episodes']} episodes with each driver; computed on {device}"
     main_name = next(iter(drivers))
     lead = f"{_driver(main_name).capitalize()} succeeds in {_shown('success', first['success'])} of the episodes."
-    blind = [one["success"] for name, one in drivers.items() if name.startswith(f"{main_name} ")]
-    lead += f" Without sight it succeeds in at most {_shown('success', max(blind))}." if blind else ""
+    lead += _sight(first, [one for name, one in drivers.items() if name.startswith(f"{main_name} ")])
     title = f"Evaluation of {evaluation['policy']} in the task {task}"
     write_whole(out, html.html_page(title, sections, subtitle, kind="Evaluation", lead=lead))
     return out
+
+
+def _sight(seeing: dict[str, Any], blind: list[dict[str, Any]]) -> str:
+    """How often the policy succeeds without sight, and what this shows; empty where it was not tried."""
+    if not blind:
+        return ""
+    most = _shown("success", max(one["success"] for one in blind))
+    needs = seeing["success_interval_95"][0] > max(one["success_interval_95"][1] for one in blind)
+    shows = "so it drives by what it sees" if needs else "so nothing shows that it uses its camera"
+    return f" Without sight it succeeds in at most {most}: {shows}."
 
 
 def _figures(drivers: dict[str, Any]) -> str:

@@ -6,6 +6,7 @@ The file itself is read and checked by `bridge.policy`.
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,12 +26,17 @@ from bridge.policy import (
     PolicyFileError,
     make_session,
     read_policy,
+    show,
 )
 from whill_mjx.effects.base import apply_chain
 from whill_mjx.evaluation.onnx_network import Network
+from whill_mjx.sensors.base import Sensor
+from whill_mjx.sensors.camera import Camera
+from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.vehicle.dynamics import nominal_world, place
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.vehicle.model import VehicleModel
+from whill_mjx.vehicle.specs import CameraMount
 from whill_mjx.vehicle.types import VehicleParams
 
 RUNTIMES = ("jax", "onnxruntime")
@@ -132,6 +138,52 @@ def camera_contract(model: VehicleModel, params: VehicleParams) -> dict[str, Any
         **{name: round(float(value), 6) + 0.0 for name, value in {**lengths, **angles}.items()},
         "fov_y": model.spec.camera.fov_y,
     }
+
+
+def sensor_contract(env: Any, params: VehicleParams) -> dict[str, dict[str, Any]]:
+    """What measures each observation of an environment, as a policy file has it: kind, settings, pose of a camera."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, sensor in env.sensors:
+        kind = sensor.name or f"{type(sensor).__module__}:{type(sensor).__qualname__}"
+        found[name] = {"kind": kind, "settings": _plain(dataclasses.asdict(sensor))}
+        if isinstance(sensor, Camera):
+            spec = env.model.spec
+            mounted = dataclasses.replace(spec, camera=sensor.mount or spec.camera)
+            found[name]["camera"] = camera_contract(dataclasses.replace(env.model, spec=mounted), params)
+    return found
+
+
+def sensors_of(contract: Any, task: Any) -> dict[str, Sensor]:
+    """The sensors that a policy's contract describes; those that this package does not know are the task's own.
+
+    Raises:
+        ValueError: a sensor is known to neither, or its settings do not suit it.
+    """
+    known, own = known_sensors(), task.observations()
+    found = {}
+    for name, about in contract.sensors.items():
+        kind = known.get(about.kind)
+        if kind is None and name not in own:
+            raise ValueError(f"observation {name!r} of the policy is measured by {about.kind!r}, which neither this "
+                             f"package nor the task {contract.task!r} has. Give the task of its training.")
+        settings: dict[str, Any] = dict(about.settings)
+        if settings.get("rate_hz", 0) is None:  # JSON has no infinity
+            settings["rate_hz"] = math.inf
+        if settings.get("mount"):
+            settings["mount"] = CameraMount(**settings["mount"])
+        try:
+            found[name] = own[name] if kind is None else kind(**settings)
+        except TypeError as error:
+            raise ValueError(f"observation {name!r} of the policy: settings {show(dict(about.settings))} do not suit a "
+                             f"{about.kind}: {error}. Export the policy again.") from error
+    return found
+
+
+def _plain(settings: Any) -> Any:
+    """Settings as JSON: an infinite rate is null."""
+    if isinstance(settings, dict):
+        return {key: _plain(value) for key, value in settings.items()}
+    return None if isinstance(settings, float) and math.isinf(settings) else settings
 
 
 def _is_ground(model: VehicleModel, effect: Any) -> bool:

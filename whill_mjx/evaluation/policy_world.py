@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bridge.policy import Contract, read_policy
-from whill_mjx.evaluation.policy_file import vehicle_file
+from bridge.policy import AGENT_KIND, KIND, AgentContract, SensorInput, pacer_of, read_policy
+from whill_mjx.evaluation.policy_file import sensors_of, vehicle_file
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.fields import PRESET, RUN, TASK, check, check_table
 from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.io.reading import read_json
-from whill_mjx.tasks.tasks import find_task
+from whill_mjx.tasks.tasks import find_task, make_task
 
 POLICY = "policy"
 """Folder of the policy within that of its training."""
@@ -32,6 +32,8 @@ class PolicyWorld:
     height: int
     """Of the camera image [pixels]."""
     width: int
+    senses: dict[str, tuple[Any, SensorInput]] = field(default_factory=dict)
+    """Sensors by name that the policy reads, as of the simulator and as of its file; none: the camera image alone."""
     unpacked: tempfile.TemporaryDirectory | None = None
     """Folder of the vehicle file of a zip; it lives as long as this record."""
 
@@ -43,26 +45,35 @@ def find_policy(path: str | Path) -> Path:
     return inside if (inside / "policy.json").is_file() and not (path / "policy.json").is_file() else path
 
 
-def read_world(path: str | Path) -> PolicyWorld:
-    """The world of a policy, or of the policy of a training.
+def read_world(path: str | Path, task: str | None = None) -> PolicyWorld:
+    """The world of a policy, or of the policy of a training; its vehicle and sensors in that of another task, if given.
 
     Raises:
         PolicyFileError: there is no policy, or it is damaged.
         ValueError: its task is unknown, or the run.json beside it is damaged.
     """
     folder = find_policy(path)
-    checked = read_policy(folder)
+    checked = read_policy(folder, (KIND, AGENT_KIND))
     contract = checked.contract
-    assert isinstance(contract, Contract)
+    commands, pacer = contract.commands, pacer_of(contract.sensors)
+    if commands is None or pacer is None:
+        raise OptionError(f"{folder}: the policy drives no vehicle, or its file does not say by which sensors. Export "
+                          "it again (whill_mjx.train writes them).")
+    name = task or contract.task
     try:
-        find_task(contract.task)
+        find_task(name)
     except ValueError as error:
-        raise OptionError(f"{folder}: {error} Give --task.") from error
-    limits = {"v_min": contract.low[0], "v_max": contract.high[0], "omega_max": contract.high[1],
-              "action_repeat": contract.action_repeat}  # fmt: skip
+        raise OptionError(f"--task {task}: {error}" if task else f"{folder}: {error} Give --task.") from error
+    limits = {"v_min": commands.low[0], "v_max": commands.high[0], "omega_max": commands.high[1],
+              "action_repeat": commands.action_repeat}  # fmt: skip
     vehicle, unpacked = vehicle_file(folder, checked)
-    fields = {**trained_fields(folder, contract.task), **limits}
-    return PolicyWorld(contract.task, fields, vehicle, contract.height, contract.width, unpacked)
+    fields = {**trained_fields(folder, name), **limits} if name == contract.task else {}
+    senses: dict[str, tuple[Any, SensorInput]] = {}
+    if isinstance(contract, AgentContract):
+        sensors = sensors_of(contract, make_task(name, **fields))
+        senses = {name: (sensors[name], about) for name, about in contract.sensors.items()}
+    height, width = pacer.size if pacer.kind == "camera" else (64, 64)
+    return PolicyWorld(name, fields, vehicle, height, width, senses, unpacked)
 
 
 def trained_fields(policy: Path, task: str) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from whill_mjx.evaluation.conditions import NAMES, Condition, nominal
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures
 from whill_mjx.evaluation.intervals import wilson_interval
+from whill_mjx.io.command_line import check_once
 from whill_mjx.io.fields import CONDITION, check
 from whill_mjx.world.randomize import check_parameter, with_parameter
 
@@ -89,6 +90,7 @@ def _parse_axis(text: str) -> Axis:
     if not equals or not values:
         raise ValueError(f"{text!r} is no axis of a sweep; write NAME=a,b,c or NAME=low:high:count.")
     if name == "vehicle":
+        check_once(f"--sweep {text}", values.split(","))
         return Axis(name, tuple(values.split(",")))
     _check_name(name)
     parts = values.replace(":", ",").split(",")

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from whill_mjx.env import POSE_METRICS
-from whill_mjx.gym.kinds import Kind, check_process, condition_of, find_kind, info_names
+from whill_mjx.gym.kinds import Carried, Kind, as_actions, check_process, condition_of, find_kind, info_names
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.tasks.tasks import TASKS, Task
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -26,7 +26,7 @@ from whill_mjx.vehicle.types import VehicleParams
 INFO = POSE_METRICS
 
 
-class WhillEnv(gymnasium.Env):
+class WhillEnv(Carried, gymnasium.Env):
     """A task as a `gymnasium.Env`: actions (2,) in [-1, 1] in, an image (64, 64, 3) uint8 or a dict of sensors out.
 
     `info` holds x, y [m], yaw [rad] of the driven-axle centre, v [m/s], omega [rad/s], goal_distance, clearance [m] and
@@ -103,13 +103,11 @@ class WhillEnv(gymnasium.Env):
 
         Raises:
             RuntimeError: before the first `reset`.
-            ValueError: an action of another shape.
+            ValueError: an action of another shape or type.
         """
         if self._state is None:
             raise RuntimeError("step was called before reset; call reset() first.")
-        action = np.asarray(action, np.float32)
-        if action.shape != (2,):
-            raise ValueError(f"the action has shape {action.shape}; it must be (2,): speed and yaw rate in [-1, 1].")
+        action = as_actions(action, (2,))
         check_process()
         self._state, time_step = self._kind.step(self._state, action)
         ends = bool(time_step.terminated), bool(time_step.truncated)
@@ -137,40 +135,6 @@ class WhillEnv(gymnasium.Env):
         if self._image is None:
             self._image = np.asarray(self._kind.picture(self._state))
         return self._image
-
-    def __getstate__(self) -> dict[str, Any]:
-        kept = {name: value for name, value in self.__dict__.items()
-                if name not in ("_kind", "env", "params", "observation_space", "action_space")}
-        return {**kept, "_state": jax.tree.map(_to_host, self._state)}
-
-    def __setstate__(self, kept: dict[str, Any]) -> None:
-        self.__dict__.update(kept)
-        self._take(find_kind(self._arguments))
-        self._state = jax.tree.map(_from_host, self._state, is_leaf=lambda leaf: isinstance(leaf, _Key))
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> WhillEnv:
-        import copy
-
-        other = type(self).__new__(type(self))
-        other.__setstate__(copy.deepcopy(self.__getstate__(), memo))
-        return other
-
-
-class _Key:
-    """A random key on its way to another process."""
-
-    def __init__(self, data: np.ndarray):
-        self.data = data
-
-
-def _to_host(leaf: Any) -> Any:
-    if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        return _Key(np.asarray(jax.random.key_data(leaf)))
-    return np.asarray(leaf)
-
-
-def _from_host(leaf: Any) -> Any:
-    return jax.random.wrap_key_data(jax.numpy.asarray(leaf.data)) if isinstance(leaf, _Key) else jax.numpy.asarray(leaf)
 
 
 def _info(metrics: dict[str, jax.Array]) -> dict[str, Any]:

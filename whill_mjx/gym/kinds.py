@@ -6,6 +6,7 @@ first environment of a kind compiles, every other one is ready at once.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import os
 from collections.abc import Mapping
@@ -21,7 +22,7 @@ import numpy as np
 from whill_mjx.batch import BatchEnv, BatchState, make_batch
 from whill_mjx.env import POSE_METRICS, make_env, observe
 from whill_mjx.evaluation.conditions import NAMES, Condition, begin_under, nominal
-from whill_mjx.io.fields import CONDITION, check
+from whill_mjx.io.fields import CONDITION, check, shown
 from whill_mjx.vehicle.types import TimeStep
 
 OPTIONS = tuple(name for name in NAMES if name != "latency" and not name.startswith("camera_"))
@@ -105,6 +106,52 @@ def strong(tree: Any) -> Any:
 
 def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+class Carried:
+    """An environment that can be pickled and copied: its arrays travel, its compiled programs stay."""
+
+    _arguments: dict[str, Any]
+    """Of `find_kind`."""
+
+    def _take(self, kind: Kind) -> None:
+        """Use the programs and spaces of a kind."""
+        raise NotImplementedError
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = {name: value for name, value in self.__dict__.items()
+                if name not in ("_kind", "env", "params") and not name.endswith("_space")}
+        return {name: jax.tree.map(_to_host, value) if name in CARRIED else value for name, value in kept.items()}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self.__dict__.update(kept)
+        self._take(find_kind(self._arguments))
+        for name in CARRIED & kept.keys():
+            setattr(self, name, jax.tree.map(_from_host, kept[name], is_leaf=lambda leaf: isinstance(leaf, _Key)))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        other = type(self).__new__(type(self))
+        other.__setstate__(copy.deepcopy(self.__getstate__(), memo))
+        return other
+
+
+CARRIED = {"_state", "_step"}
+"""Attributes that hold arrays of the device."""
+
+
+class _Key:
+    """A random key on its way to another process."""
+
+    def __init__(self, data: np.ndarray):
+        self.data = data
+
+
+def _to_host(leaf: Any) -> Any:
+    return _Key(np.asarray(jax.random.key_data(leaf))) if _is_key(leaf) else np.asarray(leaf)
+
+
+def _from_host(leaf: Any) -> Any:
+    return jax.random.wrap_key_data(jnp.asarray(leaf.data)) if isinstance(leaf, _Key) else jnp.asarray(leaf)
 
 
 _KINDS: dict[Any, Kind] = {}
@@ -195,6 +242,22 @@ def condition_of(options: Mapping[str, Any] | None) -> Condition | None:
                              "it out.")
         check("reset", CONDITION[name], value, f"option {name}")
     return dataclasses.replace(nominal(), **{name: jnp.asarray(value, float) for name, value in options.items()})
+
+
+def as_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Actions as numbers of a shape; NaN and infinities pass: they stand still and end the episode.
+
+    Raises:
+        ValueError: another shape, or no numbers.
+    """
+    try:
+        found = np.asarray(actions)
+    except ValueError:  # rows of several lengths
+        found = np.empty((), object)
+    if found.dtype.kind not in "biuf" or found.shape != shape:
+        there = f"has shape {found.shape}" if found.dtype.kind in "biuf" else f"is {shown(actions)}"
+        raise ValueError(f"the action {there}; it must be numbers of shape {shape}: speed and yaw rate in [-1, 1].")
+    return found.astype(np.float32)
 
 
 def info_names(metrics: Mapping[str, Any]) -> tuple[list[str], list[str]]:

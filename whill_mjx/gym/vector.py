@@ -13,14 +13,15 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from whill_mjx.gym import check_render_mode
-from whill_mjx.gym.kinds import check_process, condition_of, find_kind, info_names
+from whill_mjx.gym.kinds import Carried, Kind, as_actions, check_process, condition_of, find_kind, info_names
+from whill_mjx.io.fields import BATCH, check, shown
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.tasks.tasks import Task
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
 
-class WhillVectorEnv(gymnasium.vector.VectorEnv):
+class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
     """N instances of a task as a `gymnasium.vector.VectorEnv`, with all three modes of beginning anew.
 
     Instance i of `reset(seed=s)` begins in the world of `WhillEnv` after `reset(seed=s + i)`. Later episodes get keys
@@ -56,23 +57,25 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             ValueError: of `WhillEnv`; a number of instances below 1; an unknown mode.
         """
-        if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
-            raise ValueError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
-        self.num_envs = int(num_envs)
+        self.num_envs = check("WhillVectorEnv", BATCH[0], num_envs, "num_envs")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        self._kind = find_kind({
+        self._arguments = {
             "task": task, "vehicle": vehicle, "layout": layout, "observations": observations, "height": height,
             "width": width, "looks": looks, "spread": spread,
-        })  # fmt: skip
-        self.single_observation_space, self.single_action_space = self._kind.observation_space, self._kind.action_space
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        }  # fmt: skip
+        self._take(find_kind(self._arguments))
         self._randoms: list[np.random.Generator] | None = None
         self._state: Any = None
         self._step: Any = None  # the last time step
         self._ended = np.zeros(self.num_envs, bool)
+
+    def _take(self, kind: Kind) -> None:
+        self._kind = kind
+        self.single_observation_space, self.single_action_space = kind.observation_space, kind.action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -87,8 +90,9 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
             ValueError: an unknown option, a mask of another shape, or as many seeds as there are not instances.
         """
         check_process()
-        options = dict(options or {})
-        mask = options.pop("reset_mask", None)
+        options = dict(options) if isinstance(options, Mapping) else options
+        mask = options.pop("reset_mask", None) if isinstance(options, dict) else None
+        mask = None if mask is None else np.asarray(mask)
         condition = condition_of(options)
         origins = self._origins(seed, mask)
         if mask is None:
@@ -111,9 +115,7 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
         """
         if self._state is None:
             raise RuntimeError("step was called before reset; call reset() first.")
-        actions = np.asarray(actions, np.float32)
-        if actions.shape != (self.num_envs, 2):
-            raise ValueError(f"the actions have shape {actions.shape}; they must be ({self.num_envs}, 2).")
+        actions = as_actions(actions, (self.num_envs, 2))
         check_process()
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
             raise RuntimeError(f"instances {np.flatnonzero(self._ended).tolist()} have ended; begin them anew with "
@@ -148,16 +150,16 @@ class WhillVectorEnv(gymnasium.vector.VectorEnv):
         """(N,) keys of new episodes."""
         count = self.num_envs
         if mask is not None:
-            mask = np.asarray(mask)
             if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
                 raise ValueError(f"reset_mask has shape {mask.shape} and type {mask.dtype}; it must be ({count},) bool "
                                  "with at least one True.")
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + index for index in range(count)]
         else:
-            seeds = list(seed)
-        if len(seeds) != count:
-            raise ValueError(f"{len(seeds)} seeds for {count} instances. Give one seed, or one for each.")
+            seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed]
+            if len(seeds) != count or not all(one is None or isinstance(one, int | np.integer) for one in seeds):
+                raise ValueError(f"seed is {shown(seed)}; it must be a whole number, or a list of {count}, one for "
+                                 "each instance.")
         if self._randoms is None:
             self._randoms = [gymnasium.utils.seeding.np_random(None)[0] for _ in range(count)]
         for index, one in enumerate(seeds):

@@ -78,6 +78,25 @@ class Range:
         return " and ".join(part for part in (low, high) if part) or "a finite number"
 
 
+@dataclass(frozen=True)
+class With:
+    """An option that has an effect only beside another one; for `typing.Annotated`."""
+
+    option: str
+    """Name of the other field."""
+    values: tuple[Any, ...] = ()
+    """Those of its values that serve; none: any that is not empty, false or None."""
+
+    def serves(self, options: Any) -> bool:
+        """Whether the other option is as it must be."""
+        value = getattr(options, self.option)
+        return value in self.values if self.values else bool(value)
+
+    def __str__(self) -> str:
+        values = " or ".join(map(str, self.values))
+        return f"--{self.option.replace('_', '-')} {values}".strip()
+
+
 COUNT = Range(1, 10**12)
 """At least one of something, and no more than 64 bits count."""
 NOT_NEGATIVE = Range(0)
@@ -124,20 +143,29 @@ def refusing() -> Iterator[None]:
 
 
 def check_options(options: Any, prefix: str = "") -> None:
-    """Raise OptionError for the first number of an options dataclass that is not finite or not in its `Range`."""
+    """Raise OptionError for the first number of an options dataclass that is not finite or not in its `Range`, and for
+    an option without effect (`With`)."""
     hints = typing.get_type_hints(type(options), include_extras=True)
     for field in dataclasses.fields(options):
-        value = getattr(options, field.name)
-        name = prefix + field.name.replace("_", "-")
+        value, hint = getattr(options, field.name), hints[field.name]
+        name, marks = prefix + field.name.replace("_", "-"), getattr(hint, "__metadata__", ())
         if dataclasses.is_dataclass(value):
             check_options(value, f"{name}.")
-            continue
-        marks = getattr(hints[field.name], "__metadata__", ())
-        if _is_list(hints[field.name].__origin__ if marks else hints[field.name]):
-            check_once(f"--{name}", value)
-        allowed = next((mark for mark in marks if isinstance(mark, Range)), Range())
-        default = None if field.default is dataclasses.MISSING else field.default
-        check_range(f"--{name}", value, allowed, default)
+        else:
+            if _is_list(hint.__origin__ if marks else hint):
+                check_once(f"--{name}", value)
+            allowed = next((mark for mark in marks if isinstance(mark, Range)), Range())
+            check_range(f"--{name}", value, allowed, _default(field))
+        for mark in marks:
+            if isinstance(mark, With) and value != _default(field) and not mark.serves(options):
+                raise OptionError(f"--{name}: has an effect only with {mark}. Add that, or leave this out.")
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    """The default of an option; None where it has none."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return None if field.default is dataclasses.MISSING else field.default
 
 
 def run(
@@ -225,20 +253,30 @@ def _parsed(options: type, description: str | None, positional: bool, args: list
                 raise
     lines = [line.strip(FRAME) for line in complaint.getvalue().splitlines()]
     text = " ".join(line for line in lines[1:] if line).split("For full helptext")[0].strip()
+    if text.startswith("Error parsing"):
+        text = text.split("Argument helptext:")[0].strip()
     raise OptionError(f"{text.rstrip('.')}. See --help.")
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Refuse an empty word: as a path it would be the folder that the command is called in.
+    """Refuse an empty word, which as a path would be the folder that the command is called in; a path whose ~ the shell
+    has left as it is; and an option that is given again: only the last one would count.
 
     Raises:
-        OptionError: the option before it.
+        OptionError: the option before the word, or the option itself.
     """
+    seen: set[str] = set()
     for before, word in zip(["", *words], words, strict=False):
-        name, _, value = word.partition("=")
-        if not word.strip() or name.startswith("--") and "=" in word and not value.strip():
-            option = before if before.startswith("--") else name.strip() or "the command line"
+        name, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        option = name or (before if before.startswith("--") else "the command line")
+        if not word.strip() or equals and not value.strip():
             raise OptionError(f"{option}: an empty word, as of a shell variable that is not set. Give a value.")
+        if value.startswith("~/"):
+            raise OptionError(f"{option} {value}: the shell has not put your home folder in place of ~. Write it out.")
+        known = name.replace("_", "-").replace("--no-", "--", 1)
+        if known in seen:
+            raise OptionError(f"{name}: is given twice. Leave one out; several values go behind one {name}.")
+        seen |= {known} - {"", "--"}
 
 
 def check_lists(options: type, words: Sequence[str]) -> None:
@@ -267,7 +305,8 @@ def one_line(error: BaseException) -> str:
         text = f"{place}{error.strerror}. {REMEDIES.get(error.errno or 0, 'Try again or choose another place.')}"
     elif isinstance(error, MemoryError):
         text = "out of memory. Ask for less at a time."
-    return " ".join(" ".join([text, *getattr(error, "__notes__", ())]).split())
+    notes = [note for note in getattr(error, "__notes__", ()) if not note.startswith("----")]  # of JAX, on its frames
+    return " ".join(" ".join([text, *notes]).split())
 
 
 def _end(code: int, error: BaseException) -> None:

@@ -32,8 +32,8 @@ def keep_compiled() -> None:
     another process that writes the same entry cost a compilation, no more.
     """
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
-    told = sys.modules["jax"].config.values[FOLDER] if "jax" in sys.modules else None
-    if told is not None or FOLDER.upper() in os.environ:
+    given = sys.modules["jax"].config.values[FOLDER] if "jax" in sys.modules else None
+    if given is not None or FOLDER.upper() in os.environ:
         return
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     folder = Path(home) / "whill_mjx" / f"compiled-{_processor()}"  # a home may be shared by several processors

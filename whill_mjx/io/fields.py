@@ -7,19 +7,22 @@ names file, field, value, rule and remedy. This module imports nothing of the pa
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import numbers
+import types
+import typing
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+Made = TypeVar("Made")
 LONGEST_TEXT = 400  # characters of a name or a description
 SHOWN = 60  # characters of a value in an error
 SPEED = 20.0  # m/s and rad/s; more is km/h, mm/s or deg/s
 DAY = 86_400.0  # s that a trial may last: replays and grids take memory by the second
-REMEDY = "Correct it, in SI units."
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Field:
     high: float = math.inf
     """Lowest and highest value of a number, both allowed."""
     kind: str = "number"
-    """"number", "whole", "text", "table", "list" (of tables), "numbers", "texts"; "any" is not looked at."""
+    """"number", "whole", "text", "table", "list" (of tables), "numbers", "wholes", "texts"; "any" is not looked at."""
     choices: tuple[Any, ...] = ()
     """The only values that are allowed; none allows all of the kind."""
     count: int = 0
@@ -40,7 +43,8 @@ class Field:
     needed: bool = True
     exceptions: tuple[float, ...] = ()
     """Numbers that are allowed outside the range, such as inf where it means "no limit"."""
-    remedy: str = REMEDY
+    remedy: str = ""
+    """What to do; by default to correct it, in SI units where it has a unit."""
 
 
 def check(where: str, field: Field, value: Any, name: str | None = None) -> Any:
@@ -57,10 +61,11 @@ def check(where: str, field: Field, value: Any, name: str | None = None) -> Any:
         return _check_number(where, field, value, name)
     if field.kind == "any":
         return value
-    if field.kind in ("numbers", "texts"):
+    if field.kind in ("numbers", "wholes", "texts"):
         size = f"{field.count} " if field.count else ""
         if not isinstance(value, list | tuple) or (field.count and len(value) != field.count):
-            raise _error(where, name, value, f"must be a list of {size}{field.kind}", field)
+            what = "whole numbers" if field.kind == "wholes" else field.kind
+            raise _error(where, name, value, f"must be a list of {size}{what}", field)
         single = replace(field, kind=field.kind[:-1])
         return tuple(check(where, single, one, f"{name}[{index}]") for index, one in enumerate(value))
     if field.kind == "table":
@@ -115,6 +120,42 @@ def check_fields(where: str, fields: Iterable[Field], holder: Any) -> None:
             check(where, field, value)
 
 
+def record(where: str, kind: type[Made], content: Any, name: str = "") -> Made:
+    """A dataclass of numbers, texts, tuples, lists, dicts and such records, from a table of a JSON file.
+
+    Args:
+        where: the file.
+        kind: the dataclass; its type hints are what the table is held to, and every number must be finite.
+        content: as it was read.
+        name: of the table, where it is not the whole file.
+    """
+    members = {one.name: one for one in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    needed = {key for key, one in members.items()
+              if one.default is dataclasses.MISSING and one.default_factory is dataclasses.MISSING}
+    content = check_table(where, [Field(key, kind="any", needed=key in needed) for key in members], content, name)
+    hints, dot = typing.get_type_hints(kind), f"{name}." if name else ""
+    return kind(**{key: _typed(where, hints[key], value, dot + key) for key, value in content.items()})
+
+
+def _typed(where: str, hint: Any, value: Any, name: str) -> Any:
+    """A value of a JSON file as a type hint wants it."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is types.UnionType and type(None) in inner:
+        return None if value is None else _typed(where, inner[0], value, name)
+    if dataclasses.is_dataclass(hint):
+        return record(where, hint, value, name)  # type: ignore[arg-type]
+    if hint in (int, float):
+        return check(where, Field(name, kind="whole" if hint is int else "number"), value)
+    wanted, rule = {dict: (dict, "a table"), str: (str, "a text")}.get(origin or hint, ((list, tuple), "a list"))
+    if not isinstance(value, wanted):
+        raise ValueError(f"{where}: {name} is {shown(value)}; it must be {rule}. Correct it.")
+    if hint is str:
+        return value
+    if origin is dict:
+        return {key: _typed(where, inner[1], one, f"{name}.{key}") for key, one in value.items()}
+    return origin(_typed(where, inner[0], one, f"{name}[{index}]") for index, one in enumerate(value))
+
+
 def counted(count: int, what: str) -> str:
     """A number of things in words: "1 row", "3 rows"."""
     return f"{count} {what}{'' if count == 1 else 's'}"
@@ -162,7 +203,8 @@ def _check_number(where: str, field: Field, value: Any, name: str) -> float:
 
 
 def _error(where: str, name: str, value: Any, rule: str, field: Field) -> ValueError:
-    return ValueError(f"{where}: {name} is {shown(value)}; it {rule}. {field.remedy}")
+    remedy = field.remedy or ("Correct it." if field.unit == "-" else "Correct it, in SI units.")
+    return ValueError(f"{where}: {name} is {shown(value)}; it {rule}. {remedy}")
 
 
 def _optional(*fields: Field) -> tuple[Field, ...]:
@@ -346,6 +388,14 @@ TASK = (
     Field("width", "m", 0.01, 1e3),
 )
 """A task, in code and in run.json."""
+
+BUDGET = (
+    Field("steps", kind="whole", low=1, high=10**12),
+    *(Field(name, kind="whole", low=1, high=high, needed=False)
+      for name, high in (("eval_every", 10**12), ("eval_episodes", 10**6), ("instances", 10**7))),
+    *(Field(name, low=0.0, high=1.0, needed=False) for name in ("exploring_starts", "second_tries", "stop_success")),
+)  # fmt: skip
+"""How long a task is trained (`whill_mjx.tasks.base.Budget`)."""
 
 RUN = (Field("preset", kind="table"),)
 PRESET = (Field("task", kind="table"),)

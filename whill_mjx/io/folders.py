@@ -75,6 +75,9 @@ def check_place(option: str, path: Path, least_free: int = LEAST_FREE) -> None:
 
 
 def _check_place(option: str, path: Path, least_free: int) -> None:
+    for place in (path.absolute(), *path.absolute().parents):
+        if place.name == "trials" and (place.parent / "dataset.toml").exists():
+            raise FolderRefused(f"{option} {path}: lies among the trials of {place.parent}. Choose another place.")
     above = path.absolute()
     while not above.exists() and above != above.parent:
         if above.is_symlink():
@@ -145,9 +148,6 @@ def claim_folder(out: Path, kind: str, outputs: Iterable[str] = (), least_free: 
     check_place("--out", out, least_free)
     if out.exists() and not out.is_dir():
         raise FolderRefused(f"--out {out}: is a file, not a folder. Choose another place.")
-    for place in (out.absolute(), *out.absolute().parents):
-        if place.name == "trials" and (place.parent / "dataset.toml").exists():
-            raise FolderRefused(f"--out {out}: lies among the trials of {place.parent}. Choose another place.")
     found = read_identity(out, kind)
     if found is None:
         taken = [name for name in dict.fromkeys((*outputs, *RESULTS)) if (out / name).exists()]

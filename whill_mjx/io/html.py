@@ -37,9 +37,11 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowra
 caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; max-width: min(62rem, calc(100vw - 1.7rem)); }
 td.differs { background: #fff3d1; } td.differs:first-child { border-left: .25rem solid #e0a014; }
 details { margin: .6rem 0; } summary { cursor: pointer; color: #1f5f9f; }
+td small { color: #6a6a6a; display: block; }
 td.good { color: #176b32; } td.bad { color: #a31621; font-weight: 600; } td.warn { color: #8a5a00; }
 .charts { display: flex; flex-wrap: wrap; gap: .4rem 1rem; } figure { margin: .4rem 0; }
 figcaption { font-size: .84rem; color: #6a6a6a; max-width: 62rem; } img, video { max-width: 100%; }
+video { max-height: 70vh; }
 code { font-size: .84rem; overflow-wrap: anywhere; }
 svg.chart { max-width: 100%; height: auto; background: #fff; } svg text { fill: #333; font-family: inherit; }
 svg .title { font-size: 11.5px; font-weight: 600; } svg .label { font-size: 11px; } svg .tick { font-size: 10px; }
@@ -49,7 +51,8 @@ svg .grid { stroke: #e4e4e4; stroke-width: 1; } svg .band { fill: #1f6fb4; opaci
 @media (max-width: 640px) { body { font-size: 14px; padding: 0 .8rem 1.5rem; } h1 { font-size: 1.25rem; }
   h2 { font-size: 1.1rem; margin-top: 1.6rem; } .charts { display: block; } .charts svg { width: 100%; }
   nav a { padding: .25rem 0; } th, td { padding: .25rem .4rem; } figure { margin: .4rem 0; }
-  ul { padding-left: 1.2rem; } td:not(.n) { min-width: 4.2rem; } }
+  ul { padding-left: 1.2rem; } td:not(.n) { min-width: 4.2rem; } td:first-child:not(.n) { min-width: 7rem; }
+  td:last-child:not(.n) { min-width: 10rem; } }
 @media print { @page { margin: 14mm; } body { font-size: 10pt; max-width: none; padding: 0; }
   nav, video { display: none; }
   h2, h3, caption { break-after: avoid; } figure, tr, svg, img { break-inside: avoid; } .scroll { overflow: visible; }
@@ -112,6 +115,16 @@ def paragraph(text: str, style: str = "") -> str:
 def heading(text: str) -> str:
     """A heading within a section."""
     return f"<h3>{escape(text)}</h3>"
+
+
+def folded(summary: str, body: str) -> str:
+    """HTML that is shown only after a click on `summary`."""
+    return f"<details><summary>{escape(summary)}</summary>{body}</details>"
+
+
+def explained(name: str, meaning: str) -> Cell:
+    """A cell with a name, and below it what the name means."""
+    return Cell(escape(name) + (f"<small>{escape(meaning)}</small>" if meaning else ""), html=True)
 
 
 def bullets(items: Sequence[str]) -> str:

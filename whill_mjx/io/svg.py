@@ -47,6 +47,8 @@ class Axes:
     """Least span of both axes, so that noise does not fill the chart."""
     band: tuple[float, float] | None = None
     """Shaded range of y."""
+    covers: tuple[float, ...] = ()
+    """Values of y that are always inside, such as 0 and 1 of a share."""
 
 
 def line_chart(
@@ -58,7 +60,7 @@ def line_chart(
     xs = [line.x[np.isfinite(line.x) & np.isfinite(line.y)] for line in drawn]
     ys = [line.y[np.isfinite(line.x) & np.isfinite(line.y)] for line in drawn]
     x = np.concatenate([*xs, []])
-    y = np.concatenate([*ys, list(band or [])])
+    y = np.concatenate([*ys, list(band or []), list(axes.covers)])
     if not len(x):
         return f"<p>{escape(title)}: nothing to show.</p>"
     x_range, y_range = _range(x, axes.smallest), _range(y, axes.smallest)
@@ -172,15 +174,16 @@ def _ticks(
     height: float,
 ) -> list[str]:
     parts = []
-    for tick in _nice_ticks(*x_range):
+    x_ticks, y_ticks = _nice_ticks(*x_range), _nice_ticks(*y_range)
+    for tick, label in zip(x_ticks, _labels(x_ticks), strict=True):
         x = float(across(tick))
         parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{height - BOTTOM}"/>'
                      f'<text class="tick" x="{x:.1f}" y="{height - BOTTOM + 12}" text-anchor="middle">'
-                     f"{_number(tick)}</text>")
-    for tick in _nice_ticks(*y_range):
+                     f"{label}</text>")
+    for tick, label in zip(y_ticks, _labels(y_ticks), strict=True):
         y = float(down(tick))
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{width - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
-                     f'<text class="tick" x="{LEFT - 4}" y="{y + 3:.1f}" text-anchor="end">{_number(tick)}</text>')
+                     f'<text class="tick" x="{LEFT - 4}" y="{y + 3:.1f}" text-anchor="end">{label}</text>')
     return parts
 
 
@@ -216,7 +219,10 @@ def _legend(entries: Sequence[tuple[str, str, str]], width: float) -> list[str]:
 
 def _range(values: np.ndarray, smallest: float = 0.0) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
-    span = max(high - low, smallest, 1e-9 * max(abs(low), abs(high), 1e-3))
+    size = max(abs(low), abs(high))
+    span = max(high - low, smallest)
+    if span <= 1e-6 * size or span == 0:  # a constant, but for rounding
+        span = 0.1 * size or 1.0
     middle = (low + high) / 2
     return middle - 0.53 * span, middle + 0.53 * span
 
@@ -242,7 +248,13 @@ def _log_ticks(low: float, high: float) -> list[float]:
     return [t for k in decades for f in factors if low <= (t := k + math.log10(f)) <= high]
 
 
-def _number(value: float) -> str:
+def _labels(ticks: Sequence[float]) -> list[str]:
+    """Labels of ticks with as many digits as it takes to distinguish them."""
+    return next((found for digits in range(4, 10) if len(set(found := [_number(tick, digits) for tick in ticks]))
+                 == len(ticks)), [_number(tick) for tick in ticks])  # fmt: skip
+
+
+def _number(value: float, digits: int = 4) -> str:
     if 1e4 <= abs(value) < 1e7:
         return f"{value:,.0f}"
-    return "0" if abs(value) < 1e-12 else f"{value:.4g}"
+    return "0" if abs(value) < 1e-12 else f"{value:.{digits}g}"

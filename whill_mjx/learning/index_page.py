@@ -11,8 +11,8 @@ from whill_mjx.io.folders import write_whole
 
 INDEX = "index.html"
 PICTURES = {
-    "reward_curve.png": "Reward and success during the training",
-    "drives.png": "Drives of the policy in the final evaluation, from above",
+    "reward_curve.png": "Return (the sum of rewards of an episode) and shares of endings, over the training",
+    "drives.png": "Drives of the policy in the final evaluation, from above; all start at the left",
     "failures.png": "Drives of the final evaluation that failed, from above",
     "camera.mp4": "The first drives of the final evaluation: what the camera saw, and the view from above",
     "failures.mp4": "Drives of the final evaluation that failed, as they were recorded",
@@ -45,7 +45,7 @@ def write_index(out: Path, evaluation: dict[str, Any], task: str) -> Path:
     files = [(name, text) for name, text in FILES.items() if (out / name).is_file()]
     sections.append(html.Section("Files", html.links(files)))
     title = f"Training in the task {task.replace('_', ' ')}"
-    subtitle = f"the policy of environment step {evaluation['env_steps']}"
+    subtitle = f"This is the policy after {evaluation['env_steps']} environment steps, the best of the evaluations."
     policy = evaluation["policy"]
     lead = f"The policy succeeds in {policy['success']:.0%} of {policy['episodes']} unseen episodes."
     write_whole(out / INDEX, html.html_page(title, sections, subtitle, kind="Training", lead=lead))

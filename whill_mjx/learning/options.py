@@ -9,12 +9,14 @@ from typing import Annotated, Literal
 
 import jax
 
-from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, SHARE, Range, check_known
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, SHARE, Range, With, check_known
 from whill_mjx.learning.setup import TRUTH, Preset, find_preset, with_layout, with_repeat, with_settings
 from whill_mjx.learning.shaping import SAFETY, find_safety
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import LAYOUTS
 
+MODEL = With("learner", ("dreamer",))
+"""Only the world model has it."""
 PRESETS = ("auto", "paper", "transfer", "wallclock", "cpu", "smoke")
 
 
@@ -47,24 +49,24 @@ class TrainOptions:
     """Environment steps to train; none takes the preset's."""
     eval_every: Annotated[int | None, COUNT] = None
     """Environment steps between evaluations inside the run; none takes the preset's."""
-    episodes: Annotated[int, COUNT] = 100
+    episodes: Annotated[int, Range(1, 1_000_000)] = 100
     """Episodes of the final evaluation, of the policy, the planner and a random one."""
     planner: bool = True
     """Whether the planner that knows the truth drives the final evaluation too."""
-    videos: Annotated[int, NOT_NEGATIVE] = 4
+    videos: Annotated[int, Range(0, 1000)] = 4
     """Episodes, and failures, of the final evaluation shown as videos."""
     checkpoint_every_s: Annotated[float, NOT_NEGATIVE] = 60.0
     """Time between checkpoints [s]."""
     lr: Annotated[float | None, Range(0, 1, above=True)] = None
     """Learning rate; none takes the preset's."""
-    train_ratio: Annotated[float | None, Range(0, 1e6, above=True)] = None
+    train_ratio: Annotated[float | None, Range(0, 1e6, above=True), MODEL] = None
     """Replayed steps per environment step; none takes the preset's."""
     change: tuple[str, ...] = ()
     """Other settings of the learner, such as greedy_share=0.25 entropy_scale=3e-4."""
     action_repeat: Annotated[int | None, COUNT] = None
     """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
     seconds stay the preset's. None takes the preset's."""
-    targets: bool = False
+    targets: Annotated[bool, MODEL] = False
     """Let the world model also predict goal, speeds and free distances, which the simulator knows
     (`whill_mjx.sensors.privileged`). The
     policy still sees the camera alone. The presets paper and wallclock do so anyway."""
@@ -80,16 +82,16 @@ class TrainOptions:
     vary: tuple[str, ...] = ()
     """Parameters of the vehicle drawn anew in each episode of the training: body.mass=0.9x:1.1x, an effect such as
     command_delay.delay=0:0.2 (added where the vehicle lacks it), or fit for all intervals of the vehicle file."""
-    instances: Annotated[int | None, COUNT] = None
+    instances: Annotated[int | None, Range(1, 10**7)] = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
     """none (the task's reward alone), smooth (gentle commands) or safe (gentle commands and a distance kept)."""
     stop_success: Annotated[float | None, SHARE] = None
     """End when two evaluations inside the run in a row reach this share of successes. A file RUN/stop ends it too."""
-    export: Literal["last", "best"] = "best"
+    export: Annotated[Literal["last", "best"], MODEL] = "best"
     """Which parameters become RUN/policy: those at the end, or those of the best evaluation inside the run. The others
     become RUN/policy_best or RUN/policy_last, where they differ."""
-    tensorboard: bool = False
+    tensorboard: Annotated[bool, MODEL] = False
     """Write the curves of the world model's training for TensorBoard too, to RUN/tensorboard (needs tensorboardX)."""
     devices: Annotated[int | None, COUNT] = None
     """Devices over which instances and batches are split; none takes all."""

@@ -14,7 +14,7 @@ from dreamer.export import PolicyContract, SensingPolicy, export_policy, export_
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import episode_keys
 from whill_mjx.evaluation.novelty import SURPRISE, largest_surprise, limits
-from whill_mjx.evaluation.policy_file import camera_contract
+from whill_mjx.evaluation.policy_file import camera_contract, sensor_contract
 from whill_mjx.io.formats import stamp
 from whill_mjx.io.heartbeat import say
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
@@ -83,7 +83,8 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
     shown, step = obs_shape_of(course.env), partial(policy, weights)
     try:
         if isinstance(shown, dict):
-            return export_sensing(path, SensingPolicy(step, carry, shown, result.params), contract, vehicle)
+            sensors = sensor_contract(course.env, course.params)
+            return export_sensing(path, SensingPolicy(step, carry, shown, result.params, sensors), contract, vehicle)
         return export_policy(path, step, carry, result.params, contract, vehicle_file=vehicle)
     except ImportError as error:
         say(f"the policy file is left out: {error}. Install the base package and give the same command again.")

@@ -8,7 +8,6 @@ step is left out of the loss, and a truncated episode bootstraps from its own la
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,19 @@ import optax
 from flax import struct
 
 from dreamer import spaces
+from whill_mjx.io.fields import Field, check_fields
+
+PPO = (
+    *(Field(name, kind="whole", low=1, high=10**6) for name in ("width", "rollout", "epochs", "minibatches")),
+    Field("stack", kind="whole", low=1, high=1000),
+    Field("channels", kind="wholes", low=1, high=10**6, count=3),
+    Field("lr", low=1e-12, high=1.0),
+    *(Field(name, low=1e-9, high=1e6) for name in ("clip", "max_grad_norm")),
+    *(Field(name, low=0.0, high=1.0) for name in ("discount", "gae_lambda")),
+    *(Field(name, low=0.0, high=1e6) for name in ("value_scale", "entropy_scale")),
+    Field("log_std", low=-20.0, high=5.0),
+)
+"""Fields of PpoConfig."""
 
 
 @dataclass(frozen=True)
@@ -56,18 +68,7 @@ class PpoConfig:
     """Logarithm of the actions' standard deviation at the start."""
 
     def __post_init__(self) -> None:
-        for name in ("stack", "width", "rollout", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must be at least 1. Change {name}.")
-        for name in ("lr", "clip", "max_grad_norm"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must be positive. Change {name}.")
-        for name in ("discount", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must lie in 0..1. Change {name}.")
-        for name in ("value_scale", "entropy_scale"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"PpoConfig.{name} = {getattr(self, name)}: it must not be negative. Change {name}.")
+        check_fields("PpoConfig", PPO, self)
 
 
 class Network(nn.Module):
@@ -204,7 +205,7 @@ def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
 
 
 def check_minibatches(config: PpoConfig, instances: int) -> None:
-    """Raise ValueError unless the minibatches divide a rollout of so many instances."""
+    """Raise ValueError unless the minibatches divide a rollout of this many instances."""
     if instances * config.rollout % config.minibatches:
         raise ValueError(
             f"{instances} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from concurrent.futures import wait
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +24,25 @@ SHOWN = ("success", "return")
 """Figures of an evaluation in the progress bar."""
 
 
+@dataclass(frozen=True)
+class Length:
+    """How far a run goes, in environment steps summed over instances."""
+
+    total: int
+    """Rounded up to whole rollouts; a resumed run must get the same, since its learning rate spans them."""
+    last: int | None = None
+    """Where an earlier start of this run was stopped; None goes all the way."""
+
+
 def train_ppo(
     env: Any,
     config: PpoConfig,
     out: Path,
-    total_steps: int,
+    length: Length,
     seed: int,
     options: TrainingOptions = TrainingOptions(),  # noqa: B008
-    last_step: int | None = None,
 ) -> tuple[Any, int, int, float]:
-    """Train until `total_steps` environment steps, summed over instances, are done, or until `options.stop` says so.
+    """Train to the end of `length`, or until `options.stop` says so.
 
     A run that was interrupted goes on from its last checkpoint in `out`, as if nothing had happened.
 
@@ -40,17 +50,16 @@ def train_ppo(
         env: vector environment.
         config: hyperparameters.
         out: folder that gets metrics.jsonl and checkpoints/.
-        total_steps: rounded up to whole rollouts; a resumed run must get the same, since its learning rate spans them.
+        length: of the run.
         seed: of everything random.
         options: intervals, evaluation and callbacks, as for the other learner. A line is logged at each evaluation.
-        last_step: environment step at which an earlier start of this run was stopped; none trains them all.
 
     Returns:
         Parameters, environment steps, gradient steps and time [s].
     """
     out.mkdir(parents=True, exist_ok=True)
-    run = _Run(env, config, out, total_steps, options)
-    run.begin(seed, last_step)
+    run = _Run(env, config, out, length, options)
+    run.begin(seed)
     carry_out(run)
     return run.state.params, run.env_steps, run.updates, run.wall_s()
 
@@ -58,15 +67,15 @@ def train_ppo(
 class _Run:
     """One call of `train_ppo`: the state, what is counted, and when the next evaluation is due."""
 
-    def __init__(self, env: Any, config: PpoConfig, out: Path, total_steps: int, options: TrainingOptions) -> None:
+    def __init__(self, env: Any, config: PpoConfig, out: Path, length: Length, options: TrainingOptions) -> None:
         self.env, self.config, self.out, self.options = env, config, out, options
         self.each, self.updates_each = env.num_envs * config.rollout, config.epochs * config.minibatches
-        self.iterations = -(-total_steps // self.each)
+        self.iterations = -(-length.total // self.each)
+        self.last = self.iterations if length.last is None else min(self.iterations, -(-length.last // self.each))
 
-    def begin(self, seed: int, last_step: int | None) -> None:
+    def begin(self, seed: int) -> None:
         """Restore or make the state, and prepare the program of an iteration."""
         options, self.began = self.options, time.monotonic()
-        self.last = self.iterations if last_step is None else min(self.iterations, -(-last_step // self.each))
         options.announce("preparing the training: first worlds and parameters")
         total = np.int32(self.iterations)
         program = jax.jit(lambda state, total: iterate(self.env, self.config, total, state), donate_argnums=0)

@@ -18,7 +18,7 @@ from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.io.heartbeat import say
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best
 from whill_mjx.learning.options import TrainOptions
-from whill_mjx.learning.ppo_training import train_ppo
+from whill_mjx.learning.ppo_training import Length, train_ppo
 from whill_mjx.learning.setup import (
     TRUTH,
     Preset,
@@ -99,8 +99,9 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
         stop=stopper,
         announce=stage,
     )
-    env, last_step = functional_env(batch, preset.safety), stopper.total_steps(preset.total_steps)
-    return Trained(*train_ppo(env, preset.ppo, options.out, preset.total_steps, options.seed, how, last_step))
+    length = Length(preset.total_steps, stopper.total_steps(preset.total_steps))
+    env = functional_env(batch, preset.safety)
+    return Trained(*train_ppo(env, preset.ppo, options.out, length, options.seed, how))
 
 
 def evaluation_of(batch: BatchEnv, preset: Preset, seed: int) -> Evaluate:

@@ -28,6 +28,8 @@ FIELDS = (
     Field("dropout", "-", 0.0, 1.0),
     Field("noise", "-", 0.0, 1e6),
 )
+LARGEST = 10**8
+"""Numbers that one measurement may have."""
 SLACK = 1e-4
 """Rounding of times in float32 [s]."""
 
@@ -139,8 +141,47 @@ def read_sensors(
     return tuple(after), obs
 
 
+def check_sensor(name: str, sensor: Sensor, view: Callable[[Any], View], state: Any) -> None:
+    """Trace what a sensor does; ValueError, in one line, where it fails or gives something else than it says.
+
+    Args:
+        name: of the observation.
+        sensor: of a user's own.
+        view: (state) -> what the sensor may look at.
+        state: shapes of a state.
+    """
+    try:
+        jax.eval_shape(lambda state, seed: _tried(sensor, view(state), jax.random.key(seed)), state, 0)
+    except (Exception, SystemExit) as error:
+        said = str(error).strip().split("\n")[0].rstrip(".")
+        raise ValueError(f"sensor {name!r}, {type(sensor).__name__}: {type(error).__name__}: {said}. Correct the "
+                         "sensor.") from error
+
+
+def _tried(sensor: Sensor, view: View, key: jax.Array) -> jax.Array:
+    """A first measurement; raises TypeError or ValueError where something does not fit."""
+    reading = sensor.reading(view.env)
+    if not isinstance(reading, Reading):
+        raise TypeError(f"reading returns {type(reading).__name__}; it must be a Reading")
+    sizes = isinstance(reading.shape, tuple) and all(isinstance(one, int) and one >= 0 for one in reading.shape)
+    if not sizes or math.prod(reading.shape) > LARGEST:
+        raise ValueError(f"its reading has shape {reading.shape!r}; at most {LARGEST} numbers are taken")
+    if np.dtype(reading.dtype).kind not in "biuf" or not np.all(np.asarray(reading.low) <= np.asarray(reading.high)):
+        raise ValueError(f"its reading has type {reading.dtype!r} and bounds {reading.low!r} to {reading.high!r}; it "
+                         "needs numbers, the lower bound first")
+    before = sensor.begin(view)
+    found = sensor.measure(before, view, key)
+    if not isinstance(found, tuple) or len(found) != 2:
+        raise TypeError(f"measure returns {type(found).__name__}; it must be the pair (memory, value)")
+    first, then = (jax.tree.map(lambda leaf: jax.typeof(jnp.asarray(leaf)), memory) for memory in (before, found[0]))
+    if first != then:
+        raise TypeError(f"measure returns the memory {then}, begin {first}; both must be alike")
+    return _finished(sensor, reading, found[1], key)
+
+
 def _finished(sensor: Sensor, reading: Reading, value: jax.Array, key: jax.Array) -> jax.Array:
     """A measurement with its noise, in the type and within the bounds of the reading."""
+    value = jnp.asarray(value)
     if value.shape != reading.shape:
         raise ValueError(f"{type(sensor).__name__}: measured {value.shape}, but its reading says {reading.shape}. "
                          "Both must agree.")

@@ -1,8 +1,10 @@
-"""The camera of the vehicle file, at any size."""
+"""The camera of the vehicle file, or a further one, at any size."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,6 +13,7 @@ import numpy as np
 
 from whill_mjx.env import observe
 from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.vehicle.specs import CameraMount
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,8 @@ class Camera(Sensor):
     """Rows; None takes those of the environment."""
     width: int | None = None
     """Columns; None takes those of the environment."""
+    mount: CameraMount | None = None
+    """Where it sits; None: where the vehicle's camera does. A second camera has its own."""
 
     def size(self, env: Any) -> tuple[int, int]:
         """Rows and columns."""
@@ -34,7 +39,14 @@ class Camera(Sensor):
 
     def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
         height, width = self.size(view.env)
-        return memory, observe(dataclasses.replace(view.env, height=height, width=width), view.state)
+        model = view.env.model
+        if self.mount is not None:
+            model = dataclasses.replace(model, spec=dataclasses.replace(model.spec, camera=self.mount))
+        return memory, observe(dataclasses.replace(view.env, height=height, width=width, model=model), view.state)
 
-    def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
-        return value[..., ::-1, :]
+    @property
+    def mirrored(self) -> Callable[[jax.Array], jax.Array] | None:  # type: ignore[override]
+        """Left and right exchanged; None of a further camera that does not look along the vehicle's middle."""
+        mount = self.mount
+        aside = mount is not None and (mount.y or mount.roll or math.remainder(mount.yaw, math.pi))
+        return None if aside else lambda value: value[..., ::-1, :]

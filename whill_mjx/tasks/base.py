@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.io.fields import TASK, check_fields
+from whill_mjx.io.fields import BUDGET, TASK, check_fields
 from whill_mjx.tasks import terms
 from whill_mjx.tasks.parts import Draws, make_marker, room
 from whill_mjx.tasks.terms import Moment
@@ -66,6 +66,9 @@ class Budget:
     """Settings of the world model that it changes (`dreamer.DreamerConfig`)."""
     ppo: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the model-free baseline that it changes (`whill_mjx.learning.ppo.PpoConfig`)."""
+
+    def __post_init__(self) -> None:
+        check_fields("budget", BUDGET, self)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import re
 import traceback
 from collections.abc import Mapping
 from functools import lru_cache
@@ -13,12 +14,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.tasks.base import Task, World
+from whill_mjx.io.fields import shown
+from whill_mjx.sensors.base import as_sensors
+from whill_mjx.sensors.registry import known_sensors
+from whill_mjx.tasks.base import Budget, Task, World
 from whill_mjx.tasks.terms import Moment
 from whill_mjx.world.scene import Footprint
 
 METHODS = ("sample_world", "goal", "rewards", "endings", "observations")
 """What a task may define itself."""
+NAME = re.compile("[A-Za-z][A-Za-z0-9_]{0,63}")
+"""Of a task: part of file names, of Gymnasium's ids and of run.json."""
 ALIKE = 0.85
 """Similarity (`difflib`) from which the name of a method is taken for a misspelling of one of METHODS."""
 
@@ -33,6 +39,7 @@ def check_task(task: Task) -> None:
     if type(task).__module__.startswith("whill_mjx."):
         return
     _check_names(type(task))
+    _check_tables(task)
     world = _traced(task, "sample_world", _abstract((), jax.dtypes.prng_key))
     if not isinstance(world, World):
         raise _wrong(task, "sample_world", f"returns {type(world).__name__}", "a World(scene, start)")
@@ -44,6 +51,42 @@ def check_task(task: Task) -> None:
     moment = _moment(world)
     _check_scalars(task, "rewards", moment, "numbers", lambda dtype: not jnp.issubdtype(dtype, jnp.complexfloating))
     _check_scalars(task, "endings", moment, "flags (True or False)", lambda dtype: jnp.issubdtype(dtype, jnp.bool_))
+    _check_observations(task)
+
+
+def check_name(task: Task) -> None:
+    """Raise ValueError for a name that could be no part of a file's name or of Gymnasium's ids."""
+    if not isinstance(task.name, str) or not NAME.fullmatch(task.name):
+        raise ValueError(f"task {type(task).__name__}: its name is {shown(task.name)}; it must be letters, digits "
+                         "and _, a letter first. Correct it, or leave it out for the name of the class.")
+
+
+def _check_tables(task: Task) -> None:
+    """Refuse budgets or sweeps of another kind than the library asks for."""
+    for name, holds, wanted in (
+        ("budgets", _is_table(task.budgets), "a dict of Budgets by the name of a preset"),
+        ("sweeps", _is_texts(task.sweeps), "a tuple of texts such as 'light=0.5,1'"),
+        ("per_period", _is_texts(task.per_period), "a tuple of names of reward terms"),
+    ):
+        if not holds:
+            raise ValueError(f"task {task.name!r}: {name} is {shown(getattr(task, name))}; it must be {wanted}. "
+                             "Correct it.")
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, Mapping) and all(isinstance(one, Budget) for one in value.values())
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, (tuple, list)) and all(isinstance(one, str) for one in value)
+
+
+def _check_observations(task: Task) -> None:
+    """Refuse observations that are no sensors."""
+    try:
+        as_sensors(task.observations(), known_sensors())
+    except (Exception, SystemExit) as error:
+        raise _failed(task, "observations", error) from error
 
 
 def _check_names(kind: type) -> None:
@@ -58,9 +101,12 @@ def _check_names(kind: type) -> None:
 
 def _check_scalars(task: Task, method: str, moment: Any, what: str, fits: Any) -> None:
     terms = _traced(task, method, moment)
-    if not isinstance(terms, Mapping):
-        raise _wrong(task, method, f"returns {_named(terms)}", f"a dict of {what} by name")
+    if not isinstance(terms, Mapping) or not terms:
+        there = "an empty dict" if isinstance(terms, Mapping) else _named(terms)
+        raise _wrong(task, method, f"returns {there}", f"a dict of {what} by name")
     for name, value in terms.items():
+        if not isinstance(name, str):
+            raise _wrong(task, method, f"has the name {shown(name)}", "a text")
         if getattr(value, "shape", None) != () or not fits(value.dtype):
             raise _wrong(task, method, f"{name!r} is {_named(value)}", f"one of the {what}, of shape ()")
 
@@ -69,18 +115,22 @@ def _traced(task: Task, method: str, argument: Any) -> Any:
     """What a method returns for an argument, as shapes."""
     try:
         return jax.eval_shape(getattr(task, method), argument)
-    except Exception as error:
-        said = str(error).strip().split("\n")[0].rstrip(".")
-        raise ValueError(f"task {task.name!r}: {method}{_line(task, error)}: {type(error).__name__}: {said}. Correct "
-                         f"the method{_hint(error)}.") from error
+    except (Exception, SystemExit) as error:
+        raise _failed(task, method, error) from error
 
 
-def _hint(error: Exception) -> str:
+def _failed(task: Task, method: str, error: BaseException) -> ValueError:
+    said = str(error).strip().split("\n")[0].rstrip(".")
+    return ValueError(f"task {task.name!r}: {method}{_line(task, error)}: {type(error).__name__}: {said}. Correct the "
+                      f"method{_hint(error)}.")
+
+
+def _hint(error: BaseException) -> str:
     traced = isinstance(error, (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError))
     return " (it is traced: jax.numpy for numpy, jnp.where for if)" if traced else ""
 
 
-def _line(task: Task, error: Exception) -> str:
+def _line(task: Task, error: BaseException) -> str:
     """Where in the task's own file an error arose."""
     try:
         own = inspect.getfile(type(task))

@@ -37,6 +37,8 @@ def read_fields(task: Task, texts: Iterable[str], option: str = "--set") -> dict
         if name not in known:
             raise OptionError(f"{option} {text}: task {task.name!r} has no field {name!r} (known: "
                               f"{', '.join(sorted(known))}). Correct it.")
+        if name == "layout":
+            raise OptionError(f"{option} {text}: the layout has an option of its own. Give --layout {value}.")
         if name in changes:
             raise OptionError(f"{option} {text}: {name} is given twice. Leave one out.")
         changes[name] = _parse(value, known[name], f"{option} {text}")

@@ -22,6 +22,7 @@ from typing import Any
 
 import jax
 
+from whill_mjx.io.command_line import one_line
 from whill_mjx.io.registry import Registry
 from whill_mjx.tasks.base import LAYOUTS as LAYOUTS
 from whill_mjx.tasks.base import Budget as Budget
@@ -30,6 +31,7 @@ from whill_mjx.tasks.base import World as World
 from whill_mjx.tasks.base import goal_position as goal_position
 from whill_mjx.tasks.base import reward_terms as reward_terms
 from whill_mjx.tasks.base import scale_action as scale_action
+from whill_mjx.tasks.check import check_name
 from whill_mjx.tasks.corridor import Corridor as Corridor
 from whill_mjx.tasks.obstacle_course import ObstacleCourse as ObstacleCourse
 
@@ -68,6 +70,8 @@ def find_task(name: str) -> Task:
         ValueError: there is no such task, module or file, or it cannot be imported; one line that lists what is known.
     """
     place, colon, attribute = name.rpartition(":")
+    if colon and not place.endswith(".py") and not all(part.isidentifier() for part in (*place.split("."), attribute)):
+        raise ValueError(f"task {name!r}: is no name of a task. Give package.module:TASK or path/to/file.py:TASK.")
     if not colon:
         if name not in TASKS:
             if name.endswith(".py"):
@@ -81,10 +85,15 @@ def find_task(name: str) -> Task:
         there = ", ".join((*kinds, *(one for one, value in vars(module).items() if isinstance(value, Task)))) or "none"
         raise ValueError(f"task {name!r}: {place} has no task {attribute!r} (known: {there}). Correct the name.")
     try:
-        return _as_task(getattr(module, attribute), f"task {name!r}")
-    except TypeError as error:  # no task, or a field without a default
-        text = str(error).removeprefix(f"task {name!r}: ")
+        task = _as_task(getattr(module, attribute), f"task {name!r}")
+    except (Exception, SystemExit) as error:  # no task, a field without a default, or its own checks
+        text = one_line(error).removeprefix(f"task {name!r}: ")
+        text = text if isinstance(error, (TypeError, ValueError)) else f"{type(error).__name__}: {text}"
         raise ValueError(f"task {name!r}: {text.rstrip('.')}. Correct the file or the name.") from error
+    if task.name in TASKS and type(TASKS[task.name]) is not type(task):
+        other = type(TASKS[task.name]).__module__
+        raise ValueError(f"task {name!r}: it is called {task.name!r}, as one of {other} is. Give it another name.")
+    return task
 
 
 def make_task(name: str, **changes: Any) -> Task:
@@ -133,6 +142,7 @@ def _as_task(value: Any, where: str) -> Task:
     if not isinstance(value, Task):
         raise TypeError(f"{where}: {value!r} is no task. Derive its class from whill_mjx.Task.")
     hash(value)
+    check_name(value)
     return value
 
 
@@ -163,7 +173,7 @@ def _import(name: str, place: str) -> ModuleType:
             raise ValueError(f"task {name!r}: {place} cannot be imported: {error}. Install it, or correct the "
                              "file.") from error
         raise ValueError(f"task {name!r}: {error}. Give package.module:TASK or path/to/file.py:TASK.") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"task {name!r}: {place} cannot be imported: {type(error).__name__}: {error}. Correct the "
                          "file.") from error
 

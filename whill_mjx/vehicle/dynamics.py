@@ -409,10 +409,9 @@ def place(
     x: jax.Array | float,
     y: jax.Array | float,
     yaw: jax.Array | float,
-    v: jax.Array | float = 0.0,
-    omega: jax.Array | float = 0.0,
+    twist: tuple[jax.Array | float, jax.Array | float] = (0.0, 0.0),
 ) -> VehicleState:
-    """State with the reference point at (x, y) [m], heading yaw [rad] and twist (v [m/s], omega [rad/s]).
+    """State with the reference point at (x, y) [m], heading yaw [rad] and `twist` v [m/s], omega [rad/s].
 
     The chassis rests on its suspension: it tilts towards its centre of mass (small angles), and the wheels roll. On a
     ground with surfaces it stands on the plane through its contacts, and v is horizontal.
@@ -425,7 +424,7 @@ def place(
     pitch = 4 * sag * (body.com_x - middle) / spec.wheelbase**2
     roll = -4 * sag * body.com_y / spec.track**2
     height = spec.wheel_radius - sag + pitch * middle
-    x, y, yaw, v, omega = (jnp.asarray(value, dtype=body.mass.dtype) for value in (x, y, yaw, v, omega))
+    x, y, yaw, v, omega = (jnp.asarray(value, dtype=body.mass.dtype) for value in (x, y, yaw, *twist))
     forward = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
     # The origin lies reference_x behind (or ahead of) the reference point, which moves with v along the heading.
     origin = jnp.stack([x, y]) - forward * spec.reference_x

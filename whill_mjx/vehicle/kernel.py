@@ -105,7 +105,7 @@ def _lacking(traced: Any) -> str:
     """What a closed jaxpr needs that the kernel lacks; "" where it has all."""
     names = {one.primitive.name for one in traced.jaxpr.eqns} - PRIMITIVES
     if any(v.aval.shape for v in traced.jaxpr.invars):
-        names.add("arrays of so many numbers")
+        names.add("large arrays")
     known = [one for one in traced.jaxpr.eqns if one.primitive.name in PRIMITIVES]
     names |= {f"{one.primitive.name} of arrays" for one in known if any(v.aval.shape for v in one.invars + one.outvars)}
     try:

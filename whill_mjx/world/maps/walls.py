@@ -148,9 +148,9 @@ def distances_to(segments: jax.Array, x, y) -> jax.Array:
     return jnp.hypot(start[:, 0] + share * way[:, 0] - x, start[:, 1] + share * way[:, 1] - y)
 
 
-def column_angles(rotation: jax.Array, intrinsics: Intrinsics, width: int) -> jax.Array:
+def column_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
     """(width,) rad: bearing in the world of the horizon's point in each column of an image, without lens distortion."""
-    u = (jnp.arange(width) + 0.5 - intrinsics.cx) / intrinsics.fx
+    u = (jnp.arange(intrinsics.width) + 0.5 - intrinsics.cx) / intrinsics.fx
     # On the horizon a ray has no height: z = R[2,0] u + R[2,1] v + R[2,2] = 0.
     down = jnp.where(jnp.abs(rotation[2, 1]) < 1e-6, 1e-6, rotation[2, 1])
     v = -(rotation[2, 0] * u + rotation[2, 2]) / down
@@ -158,7 +158,7 @@ def column_angles(rotation: jax.Array, intrinsics: Intrinsics, width: int) -> ja
     return jnp.arctan2(y, x)
 
 
-def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: Intrinsics, width: int) -> Scene:
+def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: Intrinsics) -> Scene:
     """The scene with the walls of its map that this camera sees, in place of its last `keep` boxes.
 
     One ray per image column, along the horizon, finds the nearest wall; a scene without a map stays as it is.
@@ -167,7 +167,7 @@ def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: In
     if walls is None:
         return scene
     segments = jnp.asarray(walls.segments)
-    index = first_walls(segments, position[0], position[1], column_angles(rotation, intrinsics, width))
+    index = first_walls(segments, position[0], position[1], column_angles(rotation, intrinsics))
     index, mask = most_seen(index, walls.keep)
     fixed = scene.boxes.mask.shape[0] - walls.keep
     drawn = wall_boxes(segments, index, mask, walls.height, scene.boxes.colour[fixed])

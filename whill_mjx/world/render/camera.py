@@ -22,12 +22,14 @@ class Intrinsics:
     cx: jax.Array  # () principal point [pixels]
     cy: jax.Array
     distortion: jax.Array | None = None  # (5,) k1, k2, p1, p2, k3 as in OpenCV; None: a pinhole, which is faster
+    height: int = struct.field(pytree_node=False, default=64)  # rows of the image
+    width: int = struct.field(pytree_node=False, default=64)
 
 
 def pinhole(fov_y: float, height: int = 64, width: int = 64) -> Intrinsics:
     """Intrinsics of a camera with square pixels and vertical field of view `fov_y` [rad]."""
     focal = 0.5 * height / jnp.tan(0.5 * fov_y)
-    return Intrinsics(focal, focal, jnp.asarray(0.5 * width), jnp.asarray(0.5 * height))
+    return Intrinsics(focal, focal, jnp.asarray(0.5 * width), jnp.asarray(0.5 * height), height=height, width=width)
 
 
 def camera_rotation(yaw, pitch=0.0, roll=0.0) -> jax.Array:

@@ -132,12 +132,12 @@ def _widen(low, high, place, used) -> tuple[jax.Array, jax.Array]:
     )
 
 
-def strip_lists(boxes: Bounds, view: View, width: int, strips: int, keep: int) -> jax.Array:
+def strip_lists(boxes: Bounds, view: View, strips: int, keep: int) -> jax.Array:
     """(strips, keep) int32: the nearest boxes that each upright strip of the image can show; -1 is none.
 
     With a distorting lens the whole image is one strip.
     """
-    size = -(-width // strips)
+    size = -(-view.intrinsics.width // strips)
     edges = jnp.arange(strips + 1) * float(size)
     left, right = edges[:-1], edges[1:]
     intrinsics = view.intrinsics

@@ -18,8 +18,6 @@ def draw(
     rotation: jax.Array,
     intrinsics: Intrinsics,
     scene: Scene,
-    height: int = 64,
-    width: int = 64,
     quality: Quality = PLAIN,
 ) -> jax.Array:
     """Image (H, W, 3) uint8 of one instance; arguments and errors as `render`.
@@ -28,10 +26,10 @@ def draw(
     derivative; what is computed beside it keeps its own.
     """
     if not runs_triton():
-        return render(position, rotation, intrinsics, scene, height, width, quality)
+        return render(position, rotation, intrinsics, scene, quality)
     from whill_mjx.world.render.pallas import render_pallas
 
     position, rotation, intrinsics, scene = jax.lax.stop_gradient((position, rotation, intrinsics, scene))
-    arguments = position, rotation, intrinsics, scene, height, width, quality
+    arguments = position, rotation, intrinsics, scene, quality
     kernel = partial(render_pallas, *arguments)
     return jax.lax.platform_dependent(cuda=kernel, default=partial(render, *arguments))

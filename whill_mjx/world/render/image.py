@@ -44,8 +44,6 @@ def render(
     rotation: jax.Array,
     intrinsics: Intrinsics,
     scene: Scene,
-    height: int = 64,
-    width: int = 64,
     quality: Quality = PLAIN,
 ) -> jax.Array:
     """Image (H, W, 3) uint8 of one instance.
@@ -53,9 +51,8 @@ def render(
     Args:
         position: (3,) camera centre in the world [m].
         rotation: (3, 3) camera axes to world axes.
-        intrinsics: focal lengths, principal point and distortion.
+        intrinsics: focal lengths, principal point, distortion and image size.
         scene: what is to be seen.
-        height, width: static image size.
         quality: static: anti-aliasing, shadows, culling.
 
     Returns:
@@ -65,7 +62,7 @@ def render(
         ValueError: more primitives than labels, or a finish of another scene.
     """
     view, finite = make_view(position, rotation, intrinsics, scene)
-    return unpack_colours(_words(view, finite, _stage(view, scene, width, quality), (height, width), quality))
+    return unpack_colours(_words(view, finite, _stage(view, scene, quality), quality))
 
 
 def render_frame(
@@ -73,8 +70,6 @@ def render_frame(
     rotation: jax.Array,
     intrinsics: Intrinsics,
     scene: Scene,
-    height: int = 64,
-    width: int = 64,
     quality: Quality = PLAIN,
     normals: bool = False,
 ) -> Frame:
@@ -84,9 +79,9 @@ def render_frame(
     at depth inf.
     """
     view, finite = make_view(position, rotation, intrinsics, scene)
-    stage = _stage(view, scene, width, quality, normals)
-    word = _words(view, finite, stage, (height, width), quality)
-    row, column = _grid(height, width)
+    stage = _stage(view, scene, quality, normals)
+    word = _words(view, finite, stage, quality)
+    row, column = _grid(intrinsics)
     rays = pixel_view(view, stage, row, column)
     hit = cast(view, stage, rays)
     label = jnp.where(hit.solid, hit.code >> 2, jnp.where(hit.seen, GROUND, SKY))
@@ -124,23 +119,23 @@ def unpack_colours(word: jax.Array) -> jax.Array:
     return jax.lax.bitcast_convert_type(word, jnp.uint8)[..., :3]
 
 
-def _words(view: View, finite: jax.Array, stage: Arrays, size: tuple[int, int], quality: Quality) -> jax.Array:
+def _words(view: View, finite: jax.Array, stage: Arrays, quality: Quality) -> jax.Array:
     """(H, W) uint32 colours of an image."""
 
     def drawn(rows: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
         word = pack_channels(stage, pixel_colours(view, stage, quality, rows[:, None], columns))
         return jnp.where(finite, word, jnp.uint32(0))
 
-    rows, columns = _grid(*size)
+    rows, columns = _grid(view.intrinsics)
     return in_blocks(drawn)(rows[:, 0], view, finite, stage)
 
 
-def _grid(height: int, width: int) -> tuple[jax.Array, jax.Array]:
+def _grid(intrinsics: Intrinsics) -> tuple[jax.Array, jax.Array]:
     """Rows (H, 1) and columns (1, W): what a whole row or column shares is computed once."""
-    return jnp.arange(float(height))[:, None], jnp.arange(float(width))[None, :]
+    return jnp.arange(float(intrinsics.height))[:, None], jnp.arange(float(intrinsics.width))[None, :]
 
 
-def _stage(view: View, scene: Scene, width: int, quality: Quality, rows: bool = False) -> Arrays:
+def _stage(view: View, scene: Scene, quality: Quality, rows: bool = False) -> Arrays:
     """What every pixel meets."""
     parts = parts_of(scene)
     tables = make_tables(view, parts, scene, quality.shadows, rows)
@@ -149,7 +144,7 @@ def _stage(view: View, scene: Scene, width: int, quality: Quality, rows: bool = 
     lists = None
     if quality.keep is not None and quality.keep < parts.boxes.yaw.shape[0]:
         bounds = upright_bounds(view, parts.boxes)
-        lists = jax.lax.optimization_barrier(strip_lists(bounds, view, width, quality.strips, quality.keep))
+        lists = jax.lax.optimization_barrier(strip_lists(bounds, view, quality.strips, quality.keep))
     atlas = None if scene.finish is None else scene.finish.atlas
     return Arrays(parts, tables, lists, atlas, lit_words(scene))
 

@@ -33,7 +33,7 @@ CHUNK = 32
 
 @dataclass(frozen=True)
 class Tiling:
-    """How the image is cut for the kernel. Static."""
+    """How the image is cut for the kernel, and how that is run. Static."""
 
     rows: int = 8
     """Rows of a tile; a power of two."""
@@ -52,6 +52,8 @@ class Tiling:
     order costs more than it saves with 200 walls."""
     words: bool = False
     """Write four-byte words that XLA unpacks, instead of three bytes per pixel."""
+    interpret: bool = False
+    """Run the kernel on any device, slowly, to test."""
 
     def __post_init__(self) -> None:
         for name in ("rows", "columns", "warps"):
@@ -107,28 +109,25 @@ def render_pallas(
     rotation: jax.Array,
     intrinsics: Intrinsics,
     scene: Scene,
-    height: int = 64,
-    width: int = 64,
     quality: Quality = PLAIN,
     tiling: Tiling | None = None,
-    interpret: bool = False,
 ) -> jax.Array:
     """Image (H, W, 3) uint8 of one instance, as `render` draws it; batch it by `vmap`.
 
     Args:
-        position, rotation, intrinsics, scene, height, width, quality: as `render`; `quality.keep` has no meaning here,
+        position, rotation, intrinsics, scene, quality: as `render`; `quality.keep` has no meaning here,
             for nothing is left out.
         tiling: how the image is cut; None takes larger tiles for plain looks. Rich ones take a pixel per thread,
             whose many numbers then fit into the registers.
-        interpret: run on any device, slowly, to test.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton as plt
 
     tiling = tiling or (Tiling() if scene.rich is None else Tiling(8, 4))
+    height, width = intrinsics.height, intrinsics.width
     inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
     leaves, tree = jax.tree.flatten(inputs)
-    static = _static(scene, tiling, interpret)
+    static = _static(scene, tiling)
     down, across = -(-height // tiling.rows), -(-width // tiling.columns)
     whole = height % tiling.rows == 0 and width % tiling.columns == 0
 
@@ -157,22 +156,22 @@ def render_pallas(
         out_shape=drawn,
         grid=(down * across,),
         compiler_params=plt.CompilerParams(num_warps=tiling.warps, num_stages=tiling.stages),
-        interpret=interpret,
+        interpret=tiling.interpret,
         name="camera",
     )
     image = call(*leaves)
     return unpack_colours(image) if tiling.words else image
 
 
-def _static(scene: Scene, tiling: Tiling, interpret: bool) -> dict[str, Any]:
+def _static(scene: Scene, tiling: Tiling) -> dict[str, Any]:
     """What the kernel knows when it is compiled."""
     return {
         "bits": parts_of(scene).bits,
         "lit_words": lit_words(scene),
         "atlas_shape": None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.shape,
         "starts": _first_labels(scene),
-        "fast": tiling.fast and not interpret,
-        "interpret": interpret,
+        "fast": tiling.fast and not tiling.interpret,
+        "interpret": tiling.interpret,
         "cull": tiling.cull,
     }
 

@@ -6,7 +6,7 @@ its label, so that a pixel costs the same whatever it shows. Elementwise, shared
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,12 +39,13 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     depth = jnp.where(seen, hit.depth, 0.0)
     point = [view.position[i] + depth * way for i, way in enumerate((rays.x, rays.y, rays.z))]
     code = jnp.where(hit.solid, hit.code, 4 * GROUND)
-    row, m = stage.row(code), stage.material(code >> 2)
+    row, label = stage.row(code), code >> 2
+    m = stage.material(label)
     normal = face_normal(row, *point)
     length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
     facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
-    paint, tone = stage.settle(_paint(stage, row, m, point, pixel, code >> 2, seed))
+    paint, tone = stage.settle(_paint(stage, Surface(row, m, label, point, pixel), seed))
     light = stage.settle(_light(lights, normal, point))
     gleam = m[25] * _mirror(lights, rays, point, facing) * jnp.where(normal[2] > 0.9, 1.0, 0.0)
     looks, height = view.looks, jnp.clip(rays.z * length, 0.0, 1.0)
@@ -57,9 +58,19 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     return colours
 
 
-def _paint(stage, row, m, point, pixel, label, seed) -> tuple[list, jax.Array]:
+class Surface(NamedTuple):
+    """Where rays meet a surface, and what it is made of."""
+
+    row: list  # numbers of the face
+    material: list  # NUMBERS of them, see `material_table`
+    label: jax.Array
+    point: list  # x, y, z in the world [m]
+    pixel: jax.Array  # size of a pixel on it [m]
+
+
+def _paint(stage: Any, surface: Surface, seed: jax.Array) -> tuple[list, jax.Array]:
     """Reflectance of a surface, and the factor on it of cells, joints, blotches and grain."""
-    x, y, z = point
+    row, m, label, (x, y, z), pixel = surface
     s = row[8] * x + row[9] * y + row[10] * z + row[11]
     t = row[12] * x + row[13] * y + row[14] * z + row[15]
     own = stage.small(label.astype(jnp.uint32)) * 17.0

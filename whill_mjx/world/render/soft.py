@@ -30,15 +30,13 @@ def render_soft(
     rotation: jax.Array,
     intrinsics: Intrinsics,
     scene: Scene,
-    height: int = 64,
-    width: int = 64,
     softness: float = 0.5,
     order: float = 60.0,
 ) -> tuple[jax.Array, jax.Array]:
     """Image (H, W, 3) float in [0, 1] and depth (H, W) [m], both smooth functions of the camera.
 
     Args:
-        position, rotation, intrinsics, scene, height, width: as `render`.
+        position, rotation, intrinsics, scene: as `render`.
         softness: scale over which an edge fades [pixels].
         order: how sharply a thing hides those behind it: by (depth ratio)^order.
 
@@ -57,7 +55,8 @@ def render_soft(
         kinds.append(Thing(blocks.centre, blocks.half, blocks.rotation, blocks.colour, blocks.mask))
     things = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kinds)
 
-    row, column = (jax.lax.broadcasted_iota(jnp.float32, (height, width), axis) for axis in (0, 1))
+    size = intrinsics.height, intrinsics.width
+    row, column = (jax.lax.broadcasted_iota(jnp.float32, size, axis) for axis in (0, 1))
     u, v = pixel_rays(intrinsics, row, column)
     way = jnp.stack([u, v, jnp.ones_like(u)], -1) @ rotation.T  # (H, W, 3)
 

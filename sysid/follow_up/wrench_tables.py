@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.follow_up.terms import HARMONICS, Term, columns_of, forward_selection, library
+from sysid.follow_up.wrench_terms import HARMONICS, Term, columns_of, forward_selection, library
 from sysid.missing.unexplained import PHASES, WHEELS, align, wave_turns
 from whill_mjx.effects.unnamed import ACROSS, KNOTS, MAP, PERIODIC, QUANTITIES
 
@@ -32,7 +32,7 @@ def _bends(count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Table:
+class WrenchTable:
     """Which wrench."""
 
     quantity: str
@@ -117,7 +117,7 @@ def multiplied(
                     np.array([float(r @ r) for r in rest]))
 
 
-def penalties(products: Products, precision: np.ndarray, smoothing: float, table: Table) -> np.ndarray:
+def penalties(products: Products, precision: np.ndarray, smoothing: float, table: WrenchTable) -> np.ndarray:
     """(P + S, P + S) prior: base parameters by their spread, tables by their second differences."""
     size = len(precision)
     out = np.zeros(products.matrix.shape[1:])
@@ -130,7 +130,7 @@ def penalties(products: Products, precision: np.ndarray, smoothing: float, table
     return out
 
 
-def held_back(products: Products, precision: np.ndarray, table: Table) -> tuple[np.ndarray, float]:
+def held_back(products: Products, precision: np.ndarray, table: WrenchTable) -> tuple[np.ndarray, float]:
     """Gain (G,) of the tables on each group when fitted to the others, and the smoothing that does best."""
     best: tuple[np.ndarray, float] | None = None
     for smoothing in SMOOTHING:
@@ -153,7 +153,7 @@ def gains_without(products: Products, penalty: np.ndarray, size: int) -> np.ndar
     return gains
 
 
-def few_terms(products: Products, precision: np.ndarray, table: Table) -> tuple[np.ndarray, tuple[Term, ...]]:
+def few_terms(products: Products, precision: np.ndarray, table: WrenchTable) -> tuple[np.ndarray, tuple[Term, ...]]:
     """The best sum of few terms and its gain (G,) on each group, chosen and fitted on the other groups; none for a map.
     """
     if table.quantity == MAP:
@@ -187,7 +187,7 @@ def _only(products: Products, parts: Sequence[Sequence[int]], chosen: Sequence[i
             prior[np.ix_(order, order)])
 
 
-def turned(table: Table, columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def turned(table: WrenchTable, columns: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Columns (B, n, 2 KNOTS) with every trial's wheel at its own start angle, and the numbers of these in `PHASES`."""
     count = len(columns)
     if table.quantity not in WHEELS:
