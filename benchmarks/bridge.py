@@ -242,11 +242,11 @@ def policy_times(policy_path: Path, steps: int) -> np.ndarray:
     from bridge.policy import Policy
 
     policy = Policy.load(policy_path)
-    image = np.full((policy.contract.height, policy.contract.width, 3), 90, np.uint8)
+    seen = {name: np.full_like(value, 90) for name, value in policy.zeros().items()}
     times = []
     for _ in range(steps):
         start = time.perf_counter(), time.thread_time()
-        policy.step(image)
+        policy.step(seen)
         times.append((time.perf_counter() - start[0], time.thread_time() - start[1]))
         time.sleep(0.1)
     return 1e3 * np.array(times)
@@ -255,7 +255,7 @@ def policy_times(policy_path: Path, steps: int) -> np.ndarray:
 def cold_start(policy_path: Path) -> float:
     """Return the seconds from starting a process to its first command."""
     code = ("import sys, numpy as np; from bridge.policy import Policy; p = Policy.load(sys.argv[1]); "
-            "c = p.contract; assert np.isfinite(p.step(np.zeros((c.height, c.width, 3), np.uint8))).all()")
+            "assert np.isfinite(p.step(p.zeros())).all()")
     start = time.perf_counter()
     subprocess.run([sys.executable, "-c", code, str(policy_path)], check=True)
     return time.perf_counter() - start

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,8 +159,7 @@ class Operator:
                     if not self._moves(process, before):
                         refused += 1
                         continue
-                    robot.wait_until(lambda _, before=before: self._progress != before or process.poll() is not None,
-                                     PATIENCE)
+                    robot.wait_until(self._has_ended(process, before), PATIENCE)
         except AssertionError as error:
             raise StageError(f"bridge.manoeuvre of {plan.name} does not go on ({error}); see "
                              f"{here.log(name)}") from None
@@ -168,6 +167,10 @@ class Operator:
         if code:
             raise StageError(f"bridge.manoeuvre of {plan.name} ended with {code}: {last_line(here.log(name))}; see "
                              f"{here.log(name)}")
+
+    def _has_ended(self, process: subprocess.Popen[bytes], before: tuple[int, int]) -> Callable[[Robot], bool]:
+        """Return what says whether the replicate is driven or stopped."""
+        return lambda _: self._progress != before or process.poll() is not None
 
     @property
     def _progress(self) -> tuple[int, int]:

@@ -290,7 +290,7 @@ def kill_again_and_again(name: str, words: list[str], kills: int, seed: int, kep
 
 
 def killed_figures(kept: Kept) -> Figures:
-    """Sums over all kills, and over the bits of those runs that came to their end beside one that was left alone.
+    """Sums over all kills, and over the bits of those runs that came to their end beside another of the same command.
 
     What a kill cost is known at once; a run that was not taken to its end has no bits to compare.
     """
@@ -299,9 +299,7 @@ def killed_figures(kept: Kept) -> Figures:
     every = [one for found in runs.values() for one in found]
     if not every:
         return {}
-    compared = {name: [bits == alone[name]["bits"] for one in found for bits in one["bits"]
-                       if (one["words"], one["commit"]) == (alone[name]["words"], alone[name]["commit"])]
-                for name, found in runs.items() if name in alone}
+    compared = {name: _same_bits(found, alone.get(name)) for name, found in runs.items()}
     about = {"kills": sum(one["kills"] for one in every),
              "kills_of": {name: sum(one["kills"] for one in found) for name, found in runs.items()},
              "ended": sum(len(same) for same in compared.values()),
@@ -317,6 +315,15 @@ def killed_figures(kept: Kept) -> Figures:
     unsaved = [found["unsaved_s"] for found in alone.values()]
     longest = figure(unsaved, "s of processor time that a run computed without saving, at most", device)
     return {**figures, "kills_unsaved_s": {**longest, "value": max(unsaved), **about}}
+
+
+def _same_bits(found: list[dict[str, Any]], alone: dict[str, Any] | None) -> list[bool]:
+    """Whether each run that came to its end has the bits of the one that was left alone, or else of the first of the
+    same command and commit: one that was killed at other moments."""
+    ends: dict[tuple[str, str], list[str]] = {}
+    for one in (*([{**alone, "bits": [alone["bits"]]}] if alone else []), *found):
+        ends.setdefault((" ".join(one["words"]), one["commit"]), []).extend(one["bits"])
+    return [bits == every[0] for every in ends.values() for bits in every[1:]]
 
 
 def interrupted(name: str, words: list[str], count: int, seed: int, kept: Kept) -> None:

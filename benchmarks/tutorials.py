@@ -262,8 +262,7 @@ def computed() -> float:
 
 def run_all(given: argparse.Namespace) -> dict[str, float]:
     """Run the pages in a row; the figures of each, such as notebook_2_s and notebook_2_cpu_s [s]."""
-    kind = "notebook" if given.notebooks else "tutorial"
-    figures: dict[str, float] = {}
+    kind, figures = "notebook" if given.notebooks else "tutorial", dict[str, float]()
     for page in pages():
         number = page.name[0]
         if number in given.pages:

@@ -25,7 +25,7 @@ from whill_mjx.evaluation.intervals import wilson_interval
 
 LEAST = 30
 """Logs with nothing in them on which p-values are calibrated at least."""
-OF_ALL_SIZES = ("mean_class_size", "out_of_catalogue")
+OF_ALL_SIZES = ("mean_class_size", "out_of_catalogue", "class_accuracy", "wrong_name")
 """Figures of logs with one effect that are also taken over all its sizes together."""
 CLASSES = Path(__file__).parents[1] / "sysid/data/classes.json"
 SAME = {  # effects that the plant and the catalogue write alike: parameter, its value without and per unit of size
@@ -108,7 +108,7 @@ def read_cases(work: Path) -> Iterable[Case]:
 def share(hits: Sequence[bool], unit: str) -> dict[str, Any]:
     """A share with its 95 % interval (`low`, `high`) and number `n`."""
     low, high = wilson_interval(int(sum(hits)), len(hits))
-    return {**figure([float(np.mean(hits))], unit), "low": low, "high": high, "n": len(hits)}
+    return {**figure([float(np.mean(hits))], unit), "low": max(low, 0.0), "high": high, "n": len(hits)}
 
 
 def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -133,24 +133,29 @@ def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def of_noisy(cases: Sequence[Case]) -> dict[str, Any]:
     """False alarms, factors inside their intervals, and names, of logs noisier or quieter than the reference days."""
-    found = {}
+    found = of_noisy_nulls([one for truth, one in cases if not truth], "_noise", "0.5 to 4 times the noise")
     for level in sorted({one["noise"] for _, one in cases}):
         mine, tag = [(truth, one) for truth, one in cases if one["noise"] == level], f"_sensor_noise_{level:g}"
-        nulls = [one for truth, one in mine if not truth]
-        if nulls:
-            false = sum(one["verdict"] != "none" for one in nulls)
-            about = f"logs with nothing in them at {level:g} times the noise of the reference days"
-            found[f"false_alarms{tag}"] = {**figure([float(false)], f"of {len(nulls)} {about}"), "n": len(nulls),
-                                           "sets": sets_of(nulls)}
-            found[f"false_alarm_upper{tag}"] = figure([upper_rate(false, len(nulls))], f"share of {about}")
-            inside = [each["interval"][0] <= level <= each["interval"][1]
-                      for one in nulls for each in one["noise_levels"].values()]
-            found[f"noise_factor_coverage{tag}"] = figure(
-                [float(np.mean(inside))], f"share of {len(inside)} 95 % intervals of {len(nulls)} logs")
+        found.update(of_noisy_nulls([one for truth, one in mine if not truth], tag, f"{level:g} times the noise"))
         found.update(of_singles([(next(iter(truth)), one) for truth, one in mine if len(truth) == 1], f"_4x{tag}"))
         pairs = of_pairs([(truth, one) for truth, one in mine if len(truth) == 2])
         found.update({name + tag: one for name, one in pairs.items()})
     return found
+
+
+def of_noisy_nulls(nulls: Sequence[dict[str, Any]], tag: str, level: str) -> dict[str, Any]:
+    """The same of logs with nothing in them."""
+    if not nulls:
+        return {}
+    false, about = sum(one["verdict"] != "none" for one in nulls), (
+        f"logs with nothing in them at {level} of the reference days")
+    inside = [each["interval"][0] <= one["noise"] <= each["interval"][1]
+              for one in nulls for each in one["noise_levels"].values()]
+    return {f"false_alarms{tag}": {**figure([float(false)], f"of {len(nulls)} {about}"), "n": len(nulls),
+                                   "sets": sets_of(nulls)},
+            f"false_alarm_upper{tag}": figure([upper_rate(false, len(nulls))], f"share of {about}"),
+            f"noise_factor_coverage{tag}": share(
+                inside, f"share of {len(inside)} 95 % intervals of {len(nulls)} logs")}
 
 
 def sets_of(nulls: Sequence[dict[str, Any]]) -> int:
@@ -167,7 +172,8 @@ def calibrate(work: Path) -> None:
     """Fit the distribution of p-values where nothing is missing, on half of the sets of reference days."""
     from scipy import stats
 
-    nulls = [one for truth, one in read_cases(work) if not truth and calibrates(one)]
+    nulls = [one for truth, one in read_cases(work) if not truth and one.get("stage", "null") == "null" and
+             calibrates(one)]
     if len(nulls) < LEAST:
         raise SystemExit(f"{work}: {len(nulls)} logs with nothing in them, judged against sets 0, 2, 4 ... of "
                          f"reference days; {LEAST} are needed. Drive more with --nulls and --reference-sets.")
@@ -198,6 +204,8 @@ def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[s
         if right_ones:
             found[f"warned_right{tag}"] = share([warned(one) for one in right_ones],
                                                 f"share of {len(right_ones)} right names that come with a warning")
+            found[f"further_name{tag}"] = share([len(one["effects"]) > 1 for one in right_ones],
+                                                f"share of {len(right_ones)} right names with a further effect")
         found[f"wrong_name{tag}"] = share(wrong, about)
         found[f"noticed{tag}"] = share([one["verdict"] != "none" for _, one in known], about)
         sizes = [len(effect["class"]) for _, one in known for effect in one["effects"]]

@@ -8,6 +8,7 @@ when frames do not.
 import time
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -28,26 +29,32 @@ NOVEL = "surroundings unlike the training"
 OnNovel = Literal["ignore", "slow", "stop"]
 
 
+@dataclass(frozen=True)
+class Caution:
+    """What doubtful images cause."""
+
+    blind: OnBlind = "warn"
+    """A dark or saturated camera."""
+    novel: OnNovel = "stop"
+    """Images that surprise the policy more than its training did, where its file says how much that is."""
+
+
 class Controller:
     """One policy driving one vehicle."""
 
     def __init__(self, policy: Policy, safety: SafetyConfig, clock: Callable[[], float] = time.monotonic,
-                 on_blind: OnBlind = "warn", pace_by_stamp: bool = False, view: View | None = None,
-                 on_novel: OnNovel = "stop") -> None:
+                 pace_by_stamp: bool = False, view: View | None = None, caution: Caution = Caution()) -> None:
         """Join a policy and its limits.
 
         Args:
             policy: what drives.
             safety: limits and times.
             clock: steady clock, read only to time a policy step.
-            on_blind: what a dark or saturated camera causes.
             pace_by_stamp: run the policy at its rate in the time of the stamps instead of the wall clock's, for a
                 simulator whose time is slower or faster than the wall clock.
             view: what the policy sees of the camera's image; None: all of it.
-            on_novel: what images cause that surprise the policy more than its training did, where its file says how
-                much that is.
+            caution: what doubtful images cause.
         """
-        self._on_novel = on_novel
         self.policy = policy
         self.supervisor = Supervisor(safety)
         self.unusable = ""
@@ -57,7 +64,7 @@ class Controller:
         self.digest = 0
         """Hash of the last usable image."""
         self._clock = clock
-        self._on_blind = on_blind
+        self._caution = caution
         self._pace_by_stamp = pace_by_stamp
         self._view = view or View(policy.pacer.size if policy.pacer.kind == "camera" else (1, 1))
         self._period = 1 / policy.commands.rate_hz
@@ -196,20 +203,20 @@ class Controller:
         runs[name] = runs.get(name, 0) + 1 if image.max() <= 2 or image.min() >= 253 else 0
         if runs[name] == BLIND_FRAMES:
             self.supervisor.counts["dark or saturated"] += 1
-        if self._on_blind == "stop":
+        if self._caution.blind == "stop":
             self.supervisor.block(BLIND, self.is_blind)
-        elif self._on_blind == "slow":
+        elif self._caution.blind == "slow":
             (self.supervisor.slow.add if self.is_blind else self.supervisor.slow.discard)(BLIND)
 
     def _watch_novelty(self) -> None:
         """Slow down, then stop for good, while the policy's surprise is larger than its own world made it."""
         limits = getattr(self.policy.contract, "novelty", None)
-        if limits is None or self._on_novel == "ignore":
+        if limits is None or self._caution.novel == "ignore":
             return
         slow, stop = limits
         novelty = self.policy.novelty
         (self.supervisor.slow.add if novelty >= slow else self.supervisor.slow.discard)(NOVEL)
-        if novelty >= stop and self._on_novel == "stop":
+        if novelty >= stop and self._caution.novel == "stop":
             self.supervisor.counts["novel surroundings"] += 1
             self.supervisor.latch(NOVEL)
 

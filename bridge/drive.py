@@ -17,7 +17,7 @@ from typing import Any
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.commands import endpoints
-from bridge.controller import Controller
+from bridge.controller import Caution, Controller
 from bridge.diagnosis import Evidence, FrameLog, causes, input_cause
 from bridge.exits import Exit, OptionError, refusal
 from bridge.image import ImageError
@@ -228,7 +228,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the node until SIGTERM or Ctrl-C; return an `Exit`: FAULT where the policy file is refused."""
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
-        options = parse_arguments(parameters.as_options(ros_arguments, ros.DRIVE_NAME, "policy") + own)
+        options = parse_arguments(parameters.with_options(ros_arguments, ros.DRIVE_NAME, "policy", own))
         policy = Policy.load(options.policy)
         if options.joystick_lock and not options.require_arm:
             raise OptionError("--joystick-lock takes the joystick from the rider, so an operator must arm. Give "
@@ -239,7 +239,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return refusal(error)
     with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
-        controller = Controller(policy, safety, on_blind=options.blind, on_novel=options.novel,
+        controller = Controller(policy, safety, caution=Caution(options.blind, options.novel),
                                 pace_by_stamp=options.pace == "stamp", view=view)
         drive = DriveNode(node, controller, options)
         try:

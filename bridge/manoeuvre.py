@@ -26,7 +26,7 @@ from bridge.command_table import PERIOD, CommandTable, check_space, make_table, 
 from bridge.exits import Exit, OptionError, refusal
 from bridge.fitted_reach import simulate_reach
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
-from bridge.record import RecordNode, add_dataset_options, write_dataset_file
+from bridge.record import RecordNode, add_dataset_options, check_dataset, write_dataset_file
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.trial_writer import TrialWriter
 from bridge.vehicle_node import VehicleNode, add_options, limits
@@ -249,11 +249,12 @@ def main(arguments: list[str] | None = None) -> int:
     """
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
-        options = parse_arguments(parameters.as_options(ros_arguments, ros.MANOEUVRE_NAME, "commands") + own)
+        options = parse_arguments(parameters.with_options(ros_arguments, ros.MANOEUVRE_NAME, "commands", own))
         table, safety, place = prepare(options)
         if options.dataset and not options.check:
             for number in range(options.first, options.first + options.repeat):
                 TrialWriter.check(options.dataset, f"{options.trial}_{number}")
+            check_dataset(options.dataset)
             options.dataset.mkdir(parents=True, exist_ok=True)
             write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:

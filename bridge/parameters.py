@@ -4,7 +4,7 @@ They are read before the node exists, so a bad one ends the program before it jo
 command line itself win.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,23 @@ OF_ROS = ("use_sim_time", "start_type_description_service")
 """Parameters that every ROS node has; the node itself reads them."""
 
 
-def as_options(ros_arguments: list[str], node: str, positional: str = "") -> list[str]:
+def with_options(ros_arguments: list[str], node: str, positional: str, own: list[str]) -> list[str]:
+    """Return the words of the command line, and before them the ROS parameters that they do not give themselves.
+
+    Args and Raises: as of `as_options`; `own` are the words.
+    """
+    given = {word.partition("=")[0] for word in own if word.startswith("--")}
+    return as_options(ros_arguments, node, positional, given) + own
+
+
+def as_options(ros_arguments: list[str], node: str, positional: str = "", given: Collection[str] = ()) -> list[str]:
     """Return the ROS parameters of a node as words of the command line.
 
     Args:
         ros_arguments: what follows and includes `--ros-args`.
         node: name of the node, to find its section of a parameter file.
         positional: the parameter that is no option but stands alone.
+        given: options that are left out.
 
     Raises:
         ValueError: a parameter file cannot be read.
@@ -38,7 +48,7 @@ def as_options(ros_arguments: list[str], node: str, positional: str = "") -> lis
             continue
         if name == positional:
             words.insert(0, str(value))
-        else:
+        elif f"--{str(name).replace('_', '-')}" not in given:
             words.extend(_option(name, value))
     return words
 

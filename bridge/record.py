@@ -22,7 +22,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.commands import CommandListener
-from bridge.exits import Exit, refusal
+from bridge.exits import Exit, OptionError, refusal
 from bridge.mcap_file import mend
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
 from bridge.split_writer import SplitWriter
@@ -35,6 +35,15 @@ AHEAD = 1.0
 """Seconds by which a stamp may be ahead of this node's clock; one that is further is of another clock."""
 LOOK_PERIOD = 0.1
 """Seconds between two looks for publishers."""
+
+
+def check_dataset(dataset: Path) -> None:
+    """Raise OptionError for a folder that holds somebody's files and no dataset."""
+    if dataset.is_dir() and not (dataset / "dataset.toml").exists():
+        others = sorted(one.name for one in dataset.iterdir() if one.name != "trials" and not one.name.startswith("."))
+        if others:
+            raise OptionError(f"{dataset}: holds {others[0]} and no dataset.toml. Give the folder of a dataset, or "
+                             "a new one.")
 
 
 def write_dataset_file(dataset: Path, options: argparse.Namespace) -> None:
@@ -352,6 +361,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.recover:
         return main_recover(options.dataset)
     try:
+        check_dataset(options.dataset)
         writer: TrialWriter | SplitWriter
         if options.split:
             writer = SplitWriter(options.dataset, options.trial, options.split, say_trial)

@@ -306,13 +306,19 @@ def make_executor() -> Any:
 
 
 def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
-    """Serve callbacks until `done`, SIGTERM or Ctrl-C. The node needs a timer, which bounds the reaction time."""
+    """Serve callbacks until `done`, SIGTERM, Ctrl-C or SIGHUP, as of a terminal that closes or of a lost connection.
+
+    The node needs a timer, which bounds the reaction time. A SIGHUP that is ignored, as of `nohup`, stays so.
+    """
     stopping = []
 
     def stop(number: int, _: FrameType | None) -> None:
         stopping.append(number)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    numbers = {signal.SIGTERM, signal.SIGINT}
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.add(signal.SIGHUP)
+    before = {number: signal.signal(number, stop) for number in numbers}
     executor = make_executor()
     gc.collect()
     gc.freeze()  # what is there by now stays, so no later collection looks through it and delays a command

@@ -160,12 +160,12 @@ class Senses:
         return np.array([pose[0], pose[1], self._turned[name], pose[3], pose[4]])
 
     def watch(self, now: float) -> None:
-        """Hold the vehicle by all that is missing, too old or frozen now."""
+        """Hold the vehicle by all that is missing, frozen, or will be too old before the next look."""
+        block, soon = self._supervisor.block, now + self._supervisor.config.tick
         for name, stream in self.streams.items():
-            self._supervisor.block(f"no {name}" if stream.value is None else f"{name} too old", stream.is_silent(now))
-            if stream.value is not None:
-                self._supervisor.block(f"no {name}", False)
-            self._supervisor.block(f"{name} does not change", stream.is_frozen)
+            block(f"no {name}", stream.value is None)
+            block(f"{name} too old", stream.value is not None and stream.is_silent(soon))
+            block(f"{name} does not change", stream.is_frozen)
 
     def observation(self, paced: np.ndarray) -> np.ndarray | dict[str, np.ndarray]:
         """Return what the policy reads now, where its pacer shows `paced`; each stream must have a value."""

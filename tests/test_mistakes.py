@@ -297,6 +297,7 @@ DAMAGED = {("drive", "nowhere"), ("drive", "file"), ("drive", "empty"), ("record
     ("record", "new t --track inf", "--track"), ("record", "new t --wheelbase nan", "--wheelbase"),
     ("record", "new t --mass -1", "--mass"), ("record", "new t --v-limit nan", "--v-limit"),
     ("record", "new t --omega-limit 0", "--omega-limit"), ("record", "file t", "file"),
+    ("record", "mine t", "mine: holds vehicle.toml and no dataset.toml"),
     ("record", "new ../t", "t"), ("record", "data circle_1", "circle_1"),
     ("simulate", "--task nope", "nope"), ("simulate", "--set gates", "gates"), ("simulate", "--set gate=1", "gate"),
     ("simulate", "--episodes -1", "--episodes"), ("simulate", "--seed -1", "--seed"),

@@ -35,6 +35,7 @@ from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, run_sweep
 from whill_mjx.io.folders import RUN_FILE, claim_folder
 from whill_mjx.io.formats import stamp
 from whill_mjx.logs.dataset import plain, write_json
+from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import Task, make_task
 
@@ -215,7 +216,9 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     changes |= read_fields(task, options.set)
     if options.layout is not None:
         changes["layout"] = options.layout
-    return make_task(name, **changes)
+    task = make_task(name, **changes)
+    check_world(task)
+    return task
 
 
 def chosen_sweeps(options: EvaluateOptions, task: Task) -> list[str]:

@@ -34,6 +34,7 @@ from whill_mjx.evaluation.planner import PlannerConfig, first_plan, for_task, pl
 from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun, step_with_terms
 from whill_mjx.io.folders import check_place, whole_file, write_whole
 from whill_mjx.io.video import write_h264
+from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import LAYOUTS, TASKS
 from whill_mjx.vehicle.kinematics import reference_pose
@@ -229,6 +230,7 @@ def _env(options: Look) -> tuple[Env, VehicleParams]:
     task = named_task(options.scene, "--scene")
     with refusing():
         task = dataclasses.replace(task, **read_fields(task, options.set), layout=options.layout)
+        check_world(task)
         return make_env(task, looks=options.looks)
 
 

@@ -36,6 +36,7 @@ from whill_mjx.learning.ppo import check_minibatches
 from whill_mjx.learning.setup import Preset, variations_of
 from whill_mjx.learning.trainings import Stage, best_params, train_baseline, train_policy
 from whill_mjx.logs.dataset import plain, write_json
+from whill_mjx.tasks.check import check_world
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
@@ -70,6 +71,7 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         from sysid import load_any
 
         load_any(options.log)
+    check_world(preset.task)
     check_memory(preset, options.learner, make_env(preset.task)[0])
     if any(text != "fit" for text in preset.vary):
         variations_of([text for text in preset.vary if text != "fit"], None)

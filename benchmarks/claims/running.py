@@ -24,6 +24,18 @@ def _promises(content: dict[str, Any]) -> list[Row]:
     return [(what, f"{{{name}}}", of) for what, name, of in every if name in content["figures"]]
 
 
+def _newcomer(content: dict[str, Any]) -> list[Row]:
+    """Rows of the figures of people.json that were recorded."""
+    every = (
+        ("seconds until the first picture", "clone_to_picture_s", ""),
+        ("seconds until a vehicle is fitted to a log", "clone_to_vehicle_s", ""),
+        ("seconds until a missing effect is named", "clone_to_effect_s", ""),
+        *((f"seconds of the code of tutorial {number}", f"tutorial_{number}_s", "") for number in range(1, 7)),
+        ("pages of docs with a picture", "pages_with_picture", "|%"),
+    )
+    return [(what, f"{{{name}{form}}}") for what, name, form in every if name in content.get("figures", ())]
+
+
 def _faults(content: dict[str, Any]) -> list[Row]:
     """A row for each documented fault whose reaction was measured."""
     from benchmarks.bridge_faults import fault_rows
@@ -55,6 +67,15 @@ CLAIMS = (
             ("lines of `sysid`", "{lines_sysid}"),
             ("sentences over 35 words in README and docs", "{sentences_over_35_words}"),
         ),
+    ),
+    Claim(
+        "The code itself",
+        "How soon a newcomer has a result",
+        "people",
+        "README's commands and the tutorials in a new folder, with no compiled programs kept; the installation is not "
+        "counted.",
+        ("figure", "value"),
+        _newcomer,
     ),
     Claim(
         "The code itself",

@@ -124,7 +124,7 @@ class Policy:
         self._carry = [np.zeros(spec.shape, spec.dtype) for spec in self.contract.carry]
 
     def zeros(self) -> dict[str, np.ndarray]:
-        """Return observations of zeros, by the names of the network's inputs."""
+        """Return zeros [-] of the shape (...) of each observation, by the names of the network's inputs."""
         return {name: np.zeros(one.shape, one.dtype) for name, one in self._inputs.items()}
 
     def step(self, seen: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:

@@ -33,6 +33,7 @@ class SensorInput:
     kind: str
     """One of SHAPES; another one is measured by no vehicle that the bridge knows."""
     shape: tuple[int, ...]
+    """Of one reading."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Of the training's sensor: of a lidar its `fov` [rad] and `reach` [m], a full turn and 10 m unless given; of any
     sensor `rate_hz` [1/s] and `latency_s`, where it had its own."""

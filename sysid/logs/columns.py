@@ -45,24 +45,29 @@ STREAM_WORDS = {
     "odometry": ("odom", "odometry", "odo", "measured", "meas", "ist", "actual", "act", "feedback", "encoder", "enc",
                  "fb", "reported", "state"),
     "ground_truth": ("gt", "truth", "groundtruth", "mocap", "vicon", "optitrack", "qualisys", "icp", "slam", "amcl",
-                     "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum"),
+                     "gps", "rtk", "outside", "external", "tracker", "tracked", "marker", "lidar", "rigidbody", "tum",
+                     "motive", "tracking"),
 }
 STREAM_LAST = {word for words in STREAM_WORDS.values() for word in words}
 QUANTITY_WORDS = {
-    "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi", "kurs", "gierwinkel"),
+    "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi", "kurs", "gierwinkel", "rz"),
     "qx": ("qx",), "qy": ("qy",), "qz": ("qz",), "qw": ("qw",),
     "omega": ("omega", "yawrate", "w", "wz", "angular", "ang", "turnrate", "rot", "gyro", "gyroz", "angularvel",
               "angvel", "turn", "drehrate", "gierrate"),
     "v": ("v", "vx", "speed", "velocity", "linear", "lin", "vel", "forward", "linvel", "linearvel", "throttle",
           "geschwindigkeit", "geschw"),
-    "x": ("x", "px", "posx", "tx", "easting"), "y": ("y", "py", "posy", "ty", "northing"),
+    "x": ("x", "px", "posx", "tx", "easting", "east"), "y": ("y", "py", "posy", "ty", "northing", "north"),
 }
 TICKS = re.compile(r"tick|count|enc(oder)?s?([ _]|$)", re.IGNORECASE)
 """In the names of wheel angles that an encoder counts."""
 PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")
 """A unit of ticks: so many in a turn."""
-SIDES = {"left": {"left", "l", "lw", "wl", "vl", "lft", "links", "linkes"},
-         "right": {"right", "r", "rw", "wr", "vr", "rgt", "rechts", "rechtes"}}
+COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)
+"""In the names of columns that count rows."""
+PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")
+"""A unit of rows: so many in a second."""
+SIDES = {"left": {"left", "l", "lw", "wl", "vl", "lft", "fl", "rl", "bl", "lf", "lb", "links", "linkes"},
+         "right": {"right", "r", "rw", "wr", "vr", "rgt", "fr", "rr", "br", "rf", "rb", "rechts", "rechtes"}}
 TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime", "date", "datetime",
               "uhrzeit", "datum")
 NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", "accel", "acceleration", "acc", "mag",
@@ -125,6 +130,8 @@ def size_of(role: str, unit: str) -> float:
     """Size of a unit of a role in SI units; KeyError for one that is not known."""
     if kind_of(role) == "angle" and (turn := PER_TURN.fullmatch(unit)):
         return 2 * np.pi / float(turn[1])
+    if role == "time" and (often := PER_SECOND.fullmatch(unit)):
+        return 1 / float(often[1])
     wheel = role.rpartition(".")[2] in ("left", "right")
     return (UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(role)])[unit]
 
@@ -148,7 +155,8 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
                     if unit and not _is_known(role, unit):
                         known = ", ".join(UNITS["speed"] | UNITS["rate"] if role.endswith(("left", "right")) else
                                           UNITS[kind_of(role)])
-                        ticks = ", N/rev for N ticks in a turn" if role.endswith("_angle") else ""
+                        ticks = {"time": ", Nhz for N rows in a second"}.get(
+                            role, ", N/rev for N ticks in a turn" if role.endswith("_angle") else "")
                         raise ValueError(f"--columns {text}: {unit!r} is no unit of {role} (known: {known}{ticks}).")
                     return Column(role, table.stem, name, unit or _split_unit(name)[1], "" if unit else SAID)
     known = ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns)
@@ -268,6 +276,8 @@ def _quantity(words: list[str]) -> str | None:
     last = words[-1]
     if match := re.search(r"\b(x|y|z|theta|yaw|heading|psi) (vel|velocity|speed|rate|dot)$", text):
         return {"x": "v", "y": None, "z": None}.get(match[1], "omega")
+    if match := re.search(r"\b(?:vel|velocity|speed|rate|v) (x|y|theta|yaw|heading|psi)$", text):
+        return {"x": "v", "y": None}.get(match[1], "omega")
     if match := re.fullmatch(r"(?:\w+ )?(x|y|theta|yaw|heading) (?:pos|position)", text):
         return match[1] if match[1] in "xy" else "yaw"
     if re.search(r"(orientation|quat\w*|rotation|^q) [wxyz]$", text):
@@ -307,6 +317,8 @@ def _stream(words: list[str], file: list[str], quantity: str, table: Table) -> t
         return "wheels", True
     if quantity in ("qx", "qy", "qz", "qw") or quantity in ("x", "y", "yaw") and {"pose", "position"} & set(words):
         return "ground_truth", False
+    if {"observation", "observed", "obs"} & set(words):
+        return "odometry", True
     if {"linear", "angular"} & set(words):
         return "command", False  # a Twist by itself
     return "odometry", any(_stream_said(name, "command") for name in table.columns)
@@ -415,7 +427,7 @@ class _Known:
         clock = self.clocks.get(one.file) if one is not None else None
         if one is None or clock is None or (unit or one.unit) not in UNITS[kind_of(role)]:
             return None
-        t = self.arrays[clock.file, clock.name] * UNITS["time"][clock.unit]
+        t = self.arrays[clock.file, clock.name] * size_of("time", clock.unit)
         values = self.arrays[one.file, one.name] * UNITS[kind_of(role)][unit or one.unit]
         good = np.isfinite(t) & np.isfinite(values)
         return (t[good], values[good]) if good.sum() > 20 else None

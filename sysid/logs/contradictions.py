@@ -1,58 +1,44 @@
 """Poses that contradict the speeds beside them: another axis, frame or clock, a reset, or speeds that are none.
 
-In the vehicle's own frame a pose moves forward by v, and to the left and ahead by what a turn adds at a point beside
-the axle. A regression of both on v and omega shows the angle between the pose's x axis and the way it travels.
+Clocks are compared by rates of turning and of motion, since no frame changes them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.clocks import NONE, RESPONSE, VARIED, WHOLE, another_clock, running_fast
+from sysid.logs.directions import (
+    MOVING,
+    NONE,
+    RESPONSE,
+    SURE,
+    UNLIKE,
+    VARIED,
+    WHOLE,
+    direction,
+    far_point,
+    in_fixed_frame,
+    inverted,
+    motion_of,
+    pooled,
+)
 from sysid.logs.pose_jumps import constant_columns, frozen, jumps
 from sysid.logs.records import Trial, command_in_force
-from sysid.logs.streams import GRID_DT, SMOOTHING
+from sysid.logs.streams import SMOOTHING, speeds
 
-MOVING = 0.05  # m/s or rad/s of a pose that moves
-APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
-LITTLE = 0.75  # the same, below which something is wrong
+LITTLE = 0.75  # share of the motion that a direction must explain, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
-SURE = 4.0  # standard errors that such an angle must have
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
-PLAINER = 0.1  # share of the motion that another explanation must explain more of
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A pose's own motion beside the speeds it should have, every GRID_DT."""
-
-    t: np.ndarray  # (G,) s
-    steps: np.ndarray  # (G, 2) m/s, in the fixed frame
-    place: np.ndarray  # (G, 2) m
-    yaw: np.ndarray  # (G,)
-    turn: np.ndarray  # (G,) rad/s
-    v: np.ndarray  # (G,) m/s that it should have
-    omega: np.ndarray  # (G,) rad/s
-
-
-@dataclass(frozen=True)
-class Direction:
-    """Which way a pose travels in its own frame."""
-
-    angle: float
-    """To the left of its own heading [rad]."""
-    error: float
-    explained: float
-    """Share of the motion that this explains."""
-    gain: float = 1.0
-    """Speed of the pose over the one it should have."""
-    gain_error: float = 0.0
-    """Infinite where the tracked point would be too far off."""
+REACH, LAG_DT = 10.0, 0.1  # s of delays that are tried beside a clock that runs fast, and steps of delays
+LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
+LEFT = {"odometry": 0.5, "commands": UNLIKE}
+"""Of what is not alike, what a clock that runs fast may leave, beside what is measured and beside commands."""
+DRIFT = 0.3  # s by which clocks must come apart in a drive to be told from a delay
+FAST, RATE_STEP = 0.2, 0.005  # by which a clock may run fast or slow, and steps of the search
 
 
 def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
@@ -66,7 +52,7 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
         alone = name == "odometry" or bool(found["odometry"]) or any(trial.odometry is None for trial in trials)
         found[name] = _of_stream(name, trials, reach if name == "ground_truth" else 0.0,
                                  "commands" if alone else "odometry")
-    if not any(found.values()) and (far := _far_point(trials, reach)):
+    if not any(found.values()) and (far := far_point(trials, reach)):
         found["ground_truth"] = [far]
     return found
 
@@ -80,21 +66,21 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
     motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if not motions:
         return []
-    plain = _pooled([direction(one, reach) for one in motions])
+    plain = pooled([direction(one, reach) for one in motions])
     against = float(np.median([_likeness(one.turn, one.omega) for one in motions]))
-    if against < -WHOLE and _pooled([direction(_inverted(one), reach) for one in motions]).explained > max(
+    if against < -WHOLE and pooled([direction(inverted(one), reach) for one in motions]).explained > max(
             WHOLE, plain.explained):
         return [f"{name}: its pose is that of the fixed frame as the vehicle sees it: parent and child are exchanged. "
                 "Invert the transform: (x, y) = -R(-yaw) (x, y), then yaw = -yaw."]
+    if name == "odometry" and in_fixed_frame(motions):
+        return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
+                "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
     if plain.explained < LITTLE:
-        mirrored = _pooled([direction(one, reach, mirrored=True) for one in motions])
+        mirrored = pooled([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
             return [f"{name}: x and y turn against yaw: the frame is left-handed (y mirrored, or x and y exchanged), "
                     "or yaw is a compass heading. Counter-clockwise is positive yaw; negate y, exchange the axes, or "
                     "take 90 deg - heading."]
-        if name == "odometry" and _in_fixed_frame(motions):
-            return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
-                    "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
         if name == "odometry" and plain.explained < LITTLE / 2:
             return [f"{name}: its pose and its speeds contradict each other: v explains {plain.explained:.0%} of how "
                     "the pose moves. Check that both are of one vehicle, frame and clock."]
@@ -113,70 +99,6 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
     return []
 
 
-
-def motion_of(trial: Trial, name: str) -> Motion | None:
-    """Motion of a stream's pose beside the odometry's speeds, or the commands where there are none that move."""
-    source, odometry = getattr(trial, name), trial.odometry
-    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
-        return None
-    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
-    t = np.arange(source.t[0] + half, source.t[-1] - half, GRID_DT)
-    if len(t) < 50:
-        return None
-
-    def at(when: np.ndarray, column: np.ndarray) -> np.ndarray:
-        return np.asarray(np.interp(when, source.t, column))
-
-    steps, turn = (np.stack([at(t + half, one) - at(t - half, one) for one in columns], axis=-1) / (2 * half)
-                   for columns in ((source.x, source.y), (source.yaw,)))
-    held = command_in_force(trial.command, t - RESPONSE)
-    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
-    if odometry is not None and odometry.v.std() > NONE:
-        shifts = np.linspace(-half, half, 5)
-        v, omega = (np.mean([np.interp(t + shift, odometry.t, one) for shift in shifts], axis=0)
-                    for one in (odometry.v, odometry.omega))
-    if v.std() < VARIED:
-        return None
-    place = np.stack([at(t, source.x), at(t, source.y)], axis=-1)
-    return Motion(t, steps, place, at(t, source.yaw), turn[:, 0], v, omega)
-
-
-def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
-    """Direction in which a pose travels.
-
-    Args:
-        reach: how far from the axle's centre its point may be [m].
-        mirrored: with y negated.
-    """
-    x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
-    cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
-    along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)
-    design = np.column_stack([motion.v, motion.omega])
-    gains = np.linalg.lstsq(design, along, rcond=None)[0]
-    too_far = abs(gains[1]) > reach
-    if too_far:
-        gains[1] *= reach / abs(gains[1])
-        gains[0] = motion.v @ (along - gains[1] * motion.omega) / max(motion.v @ motion.v, 1e-12)
-    left = along - design @ gains
-    power = float(np.square(np.abs(along)).sum())
-    explained = 1 - float(np.square(np.abs(left)).sum()) / max(power, 1e-12)
-    # What v alone shows: on a circle a turned axis and a point before the axle move alike.
-    alone = motion.v - motion.omega * (motion.v @ motion.omega) / max(motion.omega @ motion.omega, 1e-12)
-    independent = max(len(left) * GRID_DT / APART, 1.0)  # samples
-    power_alone, size = independent * max(float(np.mean(np.square(alone))), 1e-12), float(abs(gains[0]))
-    across, ahead = (float(np.sqrt(np.mean(np.square(one)) / power_alone)) for one in (left.imag, left.real))
-    return Direction(float(np.angle(gains[0])), across / max(size, 1e-9), explained, size,
-                     float("inf") if too_far else ahead)
-
-
-def _inverted(motion: Motion) -> Motion:
-    """The same motion if the pose is that of the fixed frame in the vehicle's."""
-    cos, sin, half = np.cos(motion.yaw), np.sin(motion.yaw), GRID_DT / 2
-    x, y = motion.place.T
-    back = -np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
-    return replace(motion, steps=np.gradient(back, 2 * half, axis=0), place=back, yaw=-motion.yaw, turn=-motion.turn)
-
-
 def _obeys(trials: Sequence[Trial]) -> bool:
     """Whether the odometry's yaw rate has the sign of the commanded one."""
     found = [_likeness(one.odometry.omega, one.command.omega[np.maximum(
@@ -189,44 +111,121 @@ def _likeness(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.corrcoef(one, other)[0, 1]) if min(one.std(), other.std()) > MOVING else 0.0
 
 
-def _far_point(trials: Sequence[Trial], reach: float) -> str:
-    """A sentence on a tracked point that surely is farther from the axle's centre than a vehicle reaches, or none."""
-    motions = [motion for trial in trials if (motion := motion_of(trial, "ground_truth")) is not None]
-    if not motions:
+def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds beside it") -> str:
+    """A sentence on a stream of which most trials come later or earlier than the speeds beside it; else empty.
+
+    Args:
+        beside: "commands" compares with these, though there is an odometry.
+    """
+    lates = [late for trial in trials if (late := lateness(trial, name, beside == "commands")) is not None]
+    if len(lates) <= len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
         return ""
-    design = np.concatenate([np.column_stack([one.v, one.omega]) for one in motions])
-    along = np.concatenate([np.exp(-1j * one.yaw) * (one.steps[:, 0] + 1j * one.steps[:, 1]) for one in motions])
-    gains = np.linalg.lstsq(design, along, rcond=None)[0]
-    left = along - design @ gains
-    spread = np.linalg.pinv(design.T @ design) * np.square(np.abs(left)).mean() * APART / GRID_DT
-    explained = 1 - float(np.square(np.abs(left)).sum() / max(np.square(np.abs(along)).sum(), 1e-12))
-    if explained < WHOLE or abs(gains[1]) - SURE * np.sqrt(spread[1, 1]) < reach or abs(gains[0]) < 1e-9:
+    late = float(np.median(lates))
+    return (f"{name}: its motion comes {abs(late):.1f} s {'later' if late > 0 else 'earlier'} than the {beside}: "
+            f"another clock. {'Subtract' if late > 0 else 'Add'} {abs(late):.1f} s {'from' if late > 0 else 'to'} its "
+            "t.")
+
+
+def running_fast(name: str, trials: Sequence[Trial], beside: str = "commands") -> str:
+    """A sentence on a stream whose clock runs faster or slower than that of the odometry or of the commands; else
+    empty.
+
+    Args:
+        beside: "odometry" or "commands".
+    """
+    rates = np.arange(-FAST, FAST + RATE_STEP / 2, RATE_STEP)
+    curves = [curve for trial in trials if (curve := _unlikeness(trial, name, beside, rates)) is not None]
+    if not curves:
         return ""
-    place = -1j * gains[1] * abs(gains[0]) / gains[0]  # a turn moves a point ahead to the left
-    ways = (f"{abs(place.real):.2f} m {'ahead of' if place.real > 0 else 'behind'}",
-            f"{abs(place.imag):.2f} m to the {'left' if place.imag > 0 else 'right'} of")
-    return (f"ground_truth: its point is {ways[0]} and {ways[1]} the drive-axle centre, farther than the vehicle "
-            f"reaches ({reach:.2f} m). If that is so, state it: sysid.convert takes --truth-ahead {place.real:.2f} "
-            f"--truth-left {place.imag:.2f}; else take the body that is on the vehicle.")
+    unlike = np.mean(curves, axis=0)
+    k, now = int(np.argmin(unlike)), float(unlike[len(rates) // 2])
+    if not 0 < k < len(rates) - 1 or 1 - unlike[k] < WHOLE or unlike[k] > LEFT[beside] * now:
+        return ""
+    bend = unlike[k - 1] - 2 * unlike[k] + unlike[k + 1]
+    rate = rates[k] + (0.5 * float((unlike[k - 1] - unlike[k + 1]) / bend) if bend > 0 else 0.0) * RATE_STEP
+    if abs(rate) * max(trial.duration for trial in trials) < DRIFT:
+        return ""
+    how = f"about {abs(rate):.0%} {'faster' if rate > 0 else 'slower'}"
+    return (f"{name}: its clock runs {how} than that of the {beside}: the two come apart by {abs(rate) * 60:.1f} s in "
+            f"a minute. Multiply its t by {1 / (1 + rate):.2f}, or that of the {beside} by {1 + rate:.2f}, whichever "
+            "clock is wrong.")
 
 
-def _in_fixed_frame(motions: Sequence[Motion]) -> bool:
-    """Whether v follows the motion along one fixed direction, and not that along the vehicle."""
-    fixed, own = [], []
-    for one in motions:
-        cos, sin = np.cos(one.yaw), np.sin(one.yaw)
-        x, y = one.steps.T
-        fixed.append(_explained(one.v, np.column_stack([x, y])))
-        own.append(_explained(one.v, np.column_stack([cos * x + sin * y, -sin * x + cos * y, one.turn])))
-    return bool(np.median(fixed) > max(WHOLE, float(np.median(own)) + PLAINER))
+def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
+    """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
+    explains what nothing else does; None otherwise.
+
+    Rates of turning and of motion are compared: no frame changes them.
+
+    Args:
+        beside: compare with the commands, though there are measured speeds.
+    """
+    source, odometry = getattr(trial, name), trial.odometry
+    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
+        return None
+    begin, end = min(source.t[0], trial.command.t[0]), max(source.t[-1], trial.command.t[-1])
+    t = np.arange(begin, end, LAG_DT)
+    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
+    inside = (t > source.t[0] + half) & (t < source.t[-1] - half)
+    x, y, yaw = ((np.interp(t + half, source.t, one) - np.interp(t - half, source.t, one)) / (2 * half) * inside
+                 for one in (source.x, source.y, source.yaw))
+    held = command_in_force(trial.command, t - RESPONSE)
+    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
+    commanded = beside or odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
+    if odometry is not None and not commanded:
+        v, omega = (np.interp(t, odometry.t, one, 0.0, 0.0) for one in (odometry.v, odometry.omega))
+    pairs = [(ours, theirs) for ours, theirs in ((yaw, omega), (np.hypot(x, y), np.abs(v)))
+             if min(ours.std(), theirs.std()) > VARIED]
+    if not pairs:
+        return None
+    most = len(t) - 1
+    # A skid drive turns late and little, a circle has one speed: the pair that fits best shows the clock.
+    alike = max((_likeness_by_lag(ours, theirs) for ours, theirs in pairs), key=np.max)
+    now, k = float(alike[most]), int(np.argmax(alike))
+    bend = alike[k - 1] - 2 * alike[k] + alike[k + 1] if 0 < k < 2 * most else 0.0
+    late = (k - most + (0.5 * float((alike[k - 1] - alike[k + 1]) / bend) if bend < 0 else 0.0)) * LAG_DT
+    near = round(LATE[commanded] / LAG_DT)
+    against = -float(alike[most - near : most + near + 1].min())  # where the sign is reversed
+    clear = alike[k] > WHOLE and 1 - alike[k] < UNLIKE * (1 - max(now, against))
+    return late if clear and abs(late) > LATE[commanded] else None
 
 
-def _explained(signal: np.ndarray, design: np.ndarray) -> float:
-    """Share of a signal's (T,) square that columns (T, C) explain."""
-    left = signal - design @ np.linalg.lstsq(design, signal, rcond=None)[0]
-    return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
+def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.ndarray | None:
+    """How little a stream's motion is like that beside it if its clock runs fast by each of some shares (R,), at
+    whatever delay suits best; None where too little moves."""
+    ours = speeds(trial, name, smooth=True)
+    theirs = _commanded(trial) if beside == "commands" else speeds(trial, "odometry", smooth=True)
+    if ours is None or theirs is None:
+        return None
+    t = np.arange(min(ours[0][0], theirs[0][0]), max(ours[0][-1], theirs[0][-1]), LAG_DT)
+    lags = np.arange(-REACH, REACH + LAG_DT / 2, LAG_DT)
+    found = []
+    for one, other in ((np.abs(ours[1]), np.abs(theirs[1])), (ours[2], theirs[2])):
+        if min(one.std(), other.std()) > VARIED:
+            stretched = np.stack([np.interp(t * (1 + rate), ours[0], one, 0.0, 0.0) for rate in rates])
+            shifted = np.stack([np.interp(t - lag, theirs[0], other, 0.0, 0.0) for lag in lags])
+            sizes = [np.linalg.norm(each, axis=1, keepdims=True) + 1e-9 for each in (stretched, shifted)]
+            found.append(1 - ((stretched / sizes[0]) @ (shifted / sizes[1]).T).max(axis=1))
+    return np.mean(found, axis=0) if found else None
 
 
+def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [s], speed and yaw rate that a vehicle has which follows its commands with a usual lag."""
+    t = np.arange(trial.command.t[0], max(trial.duration, trial.command.t[-1]), LAG_DT / 2)
+    held = np.maximum(command_in_force(trial.command, t), 0)
+    v, omega = trial.command.v[held].copy(), trial.command.omega[held].copy()
+    share = 1 - np.exp(-LAG_DT / 2 / RESPONSE)
+    for k in range(1, len(t)):
+        v[k], omega[k] = v[k - 1] + share * (v[k] - v[k - 1]), omega[k - 1] + share * (omega[k] - omega[k - 1])
+    return t, v, omega
+
+
+def _likeness_by_lag(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Likeness (2T - 1,) of rates (T,) with others (T,) that come so many rows earlier, from 1 - T; outside of them
+    nothing moves."""
+    size = 2 * len(ours)
+    found = np.fft.irfft(np.fft.rfft(ours, size) * np.conj(np.fft.rfft(theirs, size)), size)
+    return np.roll(found, len(ours) - 1)[: size - 1] / max(float(np.linalg.norm(ours) * np.linalg.norm(theirs)), 1e-9)
 
 
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
@@ -258,14 +257,3 @@ def _empty_shares(trial: Trial) -> tuple[float, float] | None:
         faster = rate > max(MOVING, FASTER * float(np.percentile(rate, 95)))
         shares.append(float((speed == 0)[faster].mean()) if faster.sum() > 10 else float("nan"))
     return shares[0], shares[1]
-
-
-def _pooled(found: Sequence[Direction]) -> Direction:
-    """The direction of all trials together, each by how well it shows one."""
-    weights = np.array([1 / max(one.error, 1e-4) ** 2 for one in found])
-    each = np.exp(1j * np.array([one.angle for one in found]))
-    angle = float(np.angle((weights * each).sum()))
-    apart = np.angle(each * np.exp(-1j * angle))
-    scatter = float((weights * apart**2).sum() / weights.sum() / max(len(found) - 1, 1))
-    return Direction(angle, float(np.sqrt(max(1 / weights.sum(), scatter))),
-                     float(np.median([one.explained for one in found])))

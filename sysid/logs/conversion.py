@@ -21,7 +21,8 @@ from sysid.logs.metrics import relative_pose
 from sysid.logs.records import Log, PoseStream, Start, Trial
 from sysid.logs.rosbag import PACKED, Bag, clock_notes, find_bags, in_order, read_bag, stream_times
 from sysid.logs.sources import is_lerobot
-from sysid.logs.text_files import TextDrive, integrate_speeds, join_drives, read_drives, text_files
+from sysid.logs.text_files import TextDrive, join_drives, read_drives, text_files
+from sysid.logs.wheel_states import integrate_speeds
 from whill_mjx.io.command_line import WRITING, Range, With
 from whill_mjx.io.fields import COLUMNS, counted
 from whill_mjx.io.folders import unfinished
@@ -132,20 +133,10 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     notes: list[str] = []
     more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
     held_out = config.held_out
-    if is_lerobot(config.source):
-        episodes = lerobot.read(config.source)
-        spec = _spec(config, episodes.spec)
-        found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], config.columns,
-                            (spec.wheel_radius, spec.track), config.input == "wheels")
-        drives, said, fields = _text_drives(found, config)
-        notes, more = [*episodes.notes, *left, *said], more | fields
-        held_out = held_out or (() if (config.out / "dataset.toml").exists() else episodes.held_out)
-    elif not bags and not is_known(config.source) and text_files(config.source):
-        spec = _spec(config)
-        found, left = read_drives(config.source, config.columns, (spec.wheel_radius, spec.track),
-                                  config.input == "wheels")
-        drives, said, fields = _text_drives(found, config)
-        notes, more = [*left, *said], more | fields
+    if is_lerobot(config.source) or not bags and not is_known(config.source) and text_files(config.source):
+        spec, drives, notes, fields, held = _table_drives(config)
+        more |= fields
+        held_out = held_out or (() if (config.out / "dataset.toml").exists() else held)
     elif bags:
         spec = _spec(config)
         drives, notes, wheels = _any_drives(bags, config, spec)
@@ -153,20 +144,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         if wheels:
             more["input"] = "wheels"
     else:
-        from sysid.logs.inspection import load_whole
-
-        if config.columns:
-            raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
-        if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
-            raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
-                             "Leave it out.")
-        log = load_whole(config.source, config.select)
-        spec, notes = log.spec, list(log.notes)
-        drives = [trial_drive(trial) for trial in log.trials]
-        drives = [one if one.ground_truth is None else replace(one, ground_truth=_at_axle(one.ground_truth, config))
-                  for one in drives]
-        if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
-            notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
+        spec, drives, notes = _known_drives(config)
     if not drives:
         raise ValueError(f"{config.source}: no drive in it moves for {SHORTEST:g} s. Check --command-topic, or use "
                          "--split bag.")
@@ -179,6 +157,25 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
+
+
+def _known_drives(config: ConvertConfig) -> tuple[VehicleSpec, list[Drive], list[str]]:
+    """The vehicle and the trials of a dataset or a measured set, and notes."""
+    from sysid.logs.inspection import load_whole
+
+    if config.columns:
+        raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
+    if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
+        raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
+                         "Leave it out.")
+    log = load_whole(config.source, config.select)
+    drives = [trial_drive(trial) for trial in log.trials]
+    drives = [one if one.ground_truth is None else replace(one, ground_truth=_at_axle(one.ground_truth, config))
+              for one in drives]
+    notes = list(log.notes)
+    if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
+        notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
+    return log.spec, drives, notes
 
 
 def _tables_beside(source: Path) -> list[str]:
@@ -219,6 +216,24 @@ def _bags_drives(
         drives += cut_out
         notes += [f"{path.name}: {note}" for note in said]
     return drives, notes, refused
+
+
+def _table_drives(
+    config: ConvertConfig,
+) -> tuple[VehicleSpec, list[Drive], list[str], dict[str, Any], tuple[str, ...]]:
+    """Nominal geometry, trials, notes, fields of dataset.toml and held-out trials of tables or of a LeRobotDataset."""
+    said, wheels = config.columns, config.input == "wheels"
+    if not is_lerobot(config.source):
+        spec = _spec(config)
+        found, left = read_drives(config.source, said, (spec.wheel_radius, spec.track), wheels)
+        drives, notes, fields = _text_drives(found, config)
+        return spec, drives, [*left, *notes], fields, ()
+    episodes = lerobot.read(config.source)
+    spec = _spec(config, episodes.spec)
+    found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], said,
+                              (spec.wheel_radius, spec.track), wheels)
+    drives, notes, fields = _text_drives(found, config)
+    return spec, drives, [*episodes.notes, *left, *notes], fields, episodes.held_out
 
 
 def _text_drives(

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.clocks import another_clock
-from sysid.logs.contradictions import contradictions
+from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.records import Command, Log, Trial, command_in_force
+from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
 from sysid.logs.standing import said, stood
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
@@ -22,8 +21,6 @@ SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static
 SLOW_SECONDS = 1.0  # s of such commands that are enough
 ALIKE = 0.7  # correlation of a speed with a command that it follows
 SHORTEST = 6.0  # s of a trial in which clocks can be compared
-CHECK = "Check the log: "
-"""Begins what a fit says of a fault."""
 LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
 CLOSELY = 0.8  # correlation with the command at a usual delay that needs no search for a better one
 SETTLED = 1.0  # s after which a vehicle has reached what it makes of a constant command

@@ -187,7 +187,8 @@ def _parts(path: Path, info: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
         if not isinstance(names, list) or len(names) != shape[0]:
             names = [str(k) for k in range(shape[0])]
         for place, part in enumerate(names):
-            found[name if shape[0] == 1 and "timestamp" in name else f"{name}/{part}"] = name, place
+            alone = shape[0] == 1 and ("timestamp" in name or part == "0")
+            found[name if alone else f"{name}/{part}"] = name, place
     return found
 
 

@@ -13,6 +13,8 @@ from whill_mjx.vehicle.specs import VehicleSpec
 
 GYRO_SPACING = 0.05
 """Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
+CHECK = "Check the log: "
+"""Begins a note on a fault of a log."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,6 +26,7 @@ from sysid.logs.wheel_states import (
     JOYSTICK_FIELDS,
     chair_odometry,
     chair_row,
+    integrate_speeds,
     joint_row,
     joint_twist,
 )
@@ -39,12 +41,19 @@ TOPICS = {
 """Names that are looked for, the first found is taken. Odometry topics are never guessed to be ground truth."""
 TYPES = {
     "command": ("Twist", "TwistStamped"),
-    "odometry": ("Odometry", CHAIR_STATE),
+    "odometry": ("Odometry", CHAIR_STATE, "JointState"),
     "ground_truth": ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped"),
     "imu": ("Imu",),
 }
 COLUMNS = {"command": ("v", "omega"), "odometry": ("x", "y", "yaw", "v", "omega"), "ground_truth": ("x", "y", "yaw"),
            "imu": ("gyro",)}
+WHAT = {"command": "commands that reached the vehicle", "odometry": "vehicle's odometry"}
+SIDEWAYS = 0.01  # m/s of a command that is none
+NOT_READ = {"TFMessage": "which is not read: record the pose of the vehicle as Odometry or PoseStamped",
+            "AckermannDriveStamped": "which steers as cars do, and is not read",
+            "AckermannDrive": "which steers as cars do, and is not read",
+            "Path": "which is not read: record its poses as PoseStamped"}
+"""Types that hold a motion, and why none is taken from them."""
 WHEELS = ("JointState", CHAIR_STATE, "Odometry")
 """Types of the input where wheel speeds stand for commands, the first found is taken."""
 OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground_truth": "--truth-topic",
@@ -122,10 +131,11 @@ def read_bag(
     try:
         store = get_typestore(Stores.ROS2_HUMBLE)
         store.register(get_types_from_msg(CHAIR_DEFINITION + JOYSTICK_FIELDS, f"whill_msgs/msg/{CHAIR_STATE}"))
-        with AnyReader([path], default_typestore=store) as reader:
+        with _opened(AnyReader, path, store, notes) as reader:
             known = {name: str(about.msgtype) for name, about in reader.topics.items() if about.msgcount}
             chosen = choose_topics(path, known, topics or {}, notes, wheels)
             rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
+            notes += [] if "ground_truth" in chosen else _not_read(known)
     except Exception as error:  # the library lets out whatever a damaged recording leads to
         if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
             raise
@@ -137,19 +147,40 @@ def read_bag(
     for stream, topic in chosen.items():
         kept = _usable(path, stream, topic, short_type(known[topic]), rows[stream], notes)
         if len(kept) >= 2:
-            kind = short_type(known[topic])
-            times, stamps, values = kept[:, 0], kept[:, 1], kept[:, 2:]
-            if values.shape[1] != len(COLUMNS[stream]):
-                times, stamps, values = _of_wheels(stream, kind, times, stamps, values, geometry)
-                if (step := float(np.median(np.diff(times)))) > COARSE:
-                    notes.append(f"{topic}: a state each {step:.2g} s is coarse: delays and lags below that do not "
-                                 "show. Ask the driver for 20 ms (publish_interval_ms)")
-            streams[stream] = BagStream(topic, known[topic], times, stamps, values)
+            found = BagStream(topic, known[topic], kept[:, 0], kept[:, 1], kept[:, 2:])
+            streams[stream] = found if kept.shape[1] - 2 == len(COLUMNS[stream]) else _of_wheels(
+                stream, found, geometry, notes)
         elif stream not in spare:
             raise _too_few(path, topic, len(kept), stream)
         elif len(kept):
             notes.append(f"{topic}: {len(kept)} usable messages; it is left out")
     return Bag(path, streams, notes)
+
+
+@contextmanager
+def _opened(reader: Any, path: Path, store: Any, notes: list[str]) -> Iterator[Any]:
+    """A reader of a recording; of the files in its folder where metadata.yaml does not go with them, with a note."""
+    files = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES) if path.is_dir() else []
+    opened = reader([path], default_typestore=store)
+    try:
+        opened.open()
+    except Exception as error:  # as of any damaged recording
+        if not files:
+            raise
+        opened = reader(files, default_typestore=store)
+        opened.open()
+        notes.append(f"metadata.yaml does not go with its files ({str(error)[:LONGEST_REASON]}): what is in "
+                     f"{', '.join(one.name for one in files)} is read without it")
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def _not_read(known: Mapping[str, str]) -> list[str]:
+    """Notes on topics that hold a motion which is not read."""
+    kinds = {short_type(kind): topic for topic, kind in known.items()}
+    return [f"{kinds[kind]} is {kind}, {why}" for kind, why in NOT_READ.items() if kind in kinds]
 
 
 def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, list[tuple[float, ...]]]:
@@ -160,12 +191,14 @@ def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, lis
     """
     rows: dict[str, list[tuple[float, ...]]] = {stream: [] for stream in names.values()}
     broken: Counter[str] = Counter()
+    sideways = 0.0
     said = ""
     for connection, received, raw in reader.messages(connections=[one for one in reader.connections
                                                                   if one.topic in names]):
         stream = names[connection.topic]
         try:
             message: Any = reader.deserialize(raw, connection.msgtype)
+            sideways = max(sideways, _sideways(message) if stream == "command" else 0.0)
             rows[stream].append((received * 1e-9, header_time(message), *read_message(
                 stream, short_type(connection.msgtype), message)))
         except Exception as error:  # the library lets out whatever a damaged message leads to
@@ -173,6 +206,9 @@ def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, lis
             said = said or str(error)
     if broken and not any(rows.values()):
         raise ValueError(said)
+    if sideways > SIDEWAYS:
+        notes.append(f"commands also ask for up to {sideways:.2g} m/s sideways (linear.y): forward speed and yaw rate "
+                     "alone are read, and no model drives sideways. Leave such drives out")
     notes += [f"{topic}: {count} damaged messages are left out" for topic, count in broken.items()]
     return rows
 
@@ -191,7 +227,7 @@ def _usable(
     if unset.all():
         if kind == "JointState":
             raise ValueError(f"{path}: topic {topic}: no joint is called left or right. Name another topic with "
-                             "--command-topic.")
+                             f"{OPTIONS[stream]}.")
         raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
                          f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
     notes += [f"{topic}: {which.sum()} messages {what} are left out" for which, what in (
@@ -205,16 +241,21 @@ def _too_few(path: Path, topic: str, count: int, stream: str) -> ValueError:
                       f"with {OPTIONS[stream]}, or '' to go without.")
 
 
-def _of_wheels(
-    stream: str, kind: str, received: np.ndarray, stamped: np.ndarray, rows: np.ndarray, geometry: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times and values of a stream of wheel angles and rates (T, 4), in order of time."""
-    later = np.append(True, np.diff(np.maximum.accumulate(received)) > 1e-6)
-    received, stamped, rows = received[later], stamped[later], rows[later]
-    if kind == CHAIR_STATE:
+def _of_wheels(stream: str, found: BagStream, geometry: tuple[float, float], notes: list[str]) -> BagStream:
+    """A stream of wheel angles and rates (T, 4) as motion, in order of time."""
+    later = np.append(True, np.diff(np.maximum.accumulate(found.received)) > 1e-6)
+    received, rows = found.received[later], found.values[later]
+    if (step := float(np.median(np.diff(received)))) > COARSE:
+        notes.append(f"{found.topic}: a state each {step:.2g} s is coarse: delays and lags below that do not show. Ask "
+                     "the driver for 20 ms (publish_interval_ms)")
+    if short_type(found.kind) == CHAIR_STATE:
         values = chair_odometry(received, rows, *geometry)
-        return received, stamped, values if stream == "odometry" else values[:, 3:]
-    return received, stamped, joint_twist(received, rows, *geometry)
+        values = values if stream == "odometry" else values[:, 3:]
+    else:
+        values = joint_twist(received, rows, *geometry)
+        if stream == "odometry":
+            values = np.column_stack([*integrate_speeds(received, *values.T), values])
+    return replace(found, received=received, stamped=found.stamped[later], values=values)
 
 
 def _unpacked(path: Path, folder: Path) -> Path:
@@ -265,6 +306,7 @@ def choose_topics(
         usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
         fitting = [name for name, kind in known.items() if short_type(kind) in TYPES[stream]
                    and name not in (*chosen.values(), *asked.values())]
+        fitting = [name for name in fitting if short_type(known[name]) != "JointState"] or fitting
         if usual:
             chosen[stream] = usual[0]
         elif stream != "ground_truth" and len(fitting) == 1 and fitting[0] not in TOPICS["ground_truth"]:
@@ -273,15 +315,23 @@ def choose_topics(
         elif stream == "ground_truth" and (others := [name for name in fitting if "odom" not in name]):
             notes.append(f"no outside pose is taken. {', '.join(others)} may be one: {OPTIONS[stream]} {others[0]}, if "
                          "it measures the vehicle from outside")
+        elif stream in ("command", "odometry") and len(fitting) > 1:
+            said = (f"any of {', '.join(sorted(fitting))} may be the {WHAT[stream]}. Name one: {OPTIONS[stream]} "
+                    f"{sorted(fitting)[0]}")
+            if stream == "command" or not {*TOPICS["ground_truth"], asked.get("ground_truth")} & set(known):
+                raise ValueError(f"{path}: {said}")
+            notes.append(f"no odometry is taken: {said}")
     if "command" not in chosen and "command" not in asked:
-        raise ValueError(f"{path}: no command topic found (topics with messages: {listing}). Name the Twist or "
+        more = "".join(f" {one}." for one in _not_read(known))
+        raise ValueError(f"{path}: no command topic found (topics with messages: {listing}).{more} Name the Twist or "
                          "TwistStamped that was sent to the vehicle with --command-topic; or take the measured wheel "
                          "speeds in its place, with an outside pose: --input wheels.")
     if "command" not in chosen:
         raise ValueError(f"{path}: --command-topic is empty; a trial needs its commands. Name their topic.")
     if not {"odometry", "ground_truth"} & set(chosen):
-        raise ValueError(f"{path}: neither odometry nor outside pose found (topics with messages: {listing}). Name one "
-                         "with --odometry-topic or --truth-topic.")
+        more = "".join(f" {one}." for one in _not_read(known))
+        raise ValueError(f"{path}: neither odometry nor outside pose found (topics with messages: {listing}).{more} "
+                         "Name one with --odometry-topic or --truth-topic.")
     return chosen
 
 
@@ -345,6 +395,13 @@ def header_time(message: Any) -> float:
     """Header stamp [s]; nan where the message has none."""
     header = getattr(message, "header", None)
     return float("nan") if header is None else header.stamp.sec + header.stamp.nanosec * 1e-9
+
+
+def _sideways(message: Any) -> float:
+    """Size of the speed to the side that a command asks for [m/s]; 0 where it has none."""
+    twist = getattr(message, "twist", message)
+    size = abs(float(getattr(getattr(twist, "linear", None), "y", 0.0)))
+    return size if math.isfinite(size) else 0.0
 
 
 def short_type(kind: str) -> str:

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.logs.clocks import VARIED, WHOLE
-from sysid.logs.contradictions import APART, SURE, direction, motion_of
+from sysid.logs.directions import APART, SURE, VARIED, WHOLE, direction, motion_of
 from sysid.logs.records import Trial
 from sysid.logs.streams import GRID_DT, clock_shift
 from whill_mjx.vehicle.specs import VehicleSpec

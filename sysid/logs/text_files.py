@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sysid.logs.columns import (
+    COUNTS,
     QUANTITIES,
     TICKS,
     TIME_WORDS,
@@ -27,6 +28,7 @@ from sysid.logs.columns import (
     unit_named,
     with_unit,
 )  # fmt: skip
+from sysid.logs.wheel_states import integrate_speeds
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
@@ -146,7 +148,10 @@ def read_table(path: Path) -> Table:
         raise ValueError(f"{path}: no rows. Give a table of numbers with a line of names.")
     split = _splitter(data[len(data) // 2][1])
     data = _without_preamble(path, data, split)
-    if path.read_bytes()[:1] == b"%" and comments and len(_cells(comments[0], split)) == len(_cells(data[0][1], split)):
+    if stacked := _stacked_names([_cells(line, split) for _, line in data[:PREAMBLE]]):
+        header, data = stacked[0], data[stacked[1] :]
+    elif comments and path.read_bytes()[:1] == b"%" and (
+            len(_cells(comments[0], split)) == len(_cells(data[0][1], split))):
         header = _cells(comments[0], split)  # of `rostopic echo -p`
     elif not _is_numbers([cell.replace(",", ".") for cell in _cells(data[0][1], split)]):
         header, data = _cells(data[0][1], split), data[1:]
@@ -250,6 +255,22 @@ def _without_preamble(path: Path, data: list[tuple[int, str]], split: str | None
             split == "," and usual > len(names)) else " Save it again."
         raise ValueError(f"{path}, line {data[first][0]}: has {usual} cells, the names above it {len(names)}.{cause}")
     return data[first:]
+
+
+def _stacked_names(rows: Sequence[Sequence[str]]) -> tuple[list[str], int] | None:
+    """Names of columns above which, or below which, further lines of words stand, and how many lines that are; None
+    where one line has the names. Motion-capture programs write a body, a quantity and an axis in a line each."""
+    first = next((k for k, row in enumerate(rows) if 2 * sum(map(_is_numbers, [[one] for one in row if one]))
+                  > max(len([one for one in row if one]), 1)), 0)
+    units = first > 1 and all(unit_named(one) for one in rows[first - 1] if one) and any(rows[first - 1])
+    last = first - 1 - units
+    if last < 1 or len({len(row) for row in rows[: first + 1]}) > 1:
+        return None
+    names, above = list(rows[last]), rows[last - 1]
+    if len(set(names)) < len(names):
+        names = [f"{over} {name}".strip() for over, name in zip(above, names, strict=True)]
+    names = [name or over for name, over in zip(names, above, strict=True)]
+    return [with_unit(name, unit) for name, unit in zip(names, rows[first - 1], strict=True)] if units else names, first
 
 
 def _numbers(cells: Sequence[str]) -> np.ndarray:
@@ -371,6 +392,9 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         said = next((f" Its {name} holds {shown(cell)}, which is no time that is known: write seconds, or "
                      "YYYY-MM-DD HH:MM:SS.SSS." for name, cell in texts.items()
                      if set(re.split("[^a-z]+", name.lower())) & set(TIME_WORDS)), "")
+        table = next(table for table in tables if table.stem == timeless[0])
+        said = said or next((f" If its {name} counts rows, say how many there are in a second: time={table.stem}/{name}"
+                             ":100hz." for name in table.columns if COUNTS.search(name)), "")
         return f"no column of {timeless[0]} is surely its time.{said}"
     arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
     for one in columns:
@@ -478,7 +502,7 @@ def _stream(
     mine = [one for one in mine if one.file == file]
     table = next(one for one in tables if one.stem == file)
     clock = next(one for one in columns if one.role == "time" and one.file == file)
-    found = {"t": table.columns[clock.name] * UNITS["time"][clock.unit]}
+    found = {"t": table.columns[clock.name] * size_of("time", clock.unit)}
     for one in mine:
         found[one.role.partition(".")[2]] = table.columns[one.name] * size_of(one.role, one.unit)
     whole = np.isfinite(list(found.values())).all(axis=0)
@@ -590,13 +614,3 @@ def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> 
 def _dead_reckoned(rates: np.ndarray) -> np.ndarray:
     """(T, 6) odometry of speeds (T, 3)."""
     return np.column_stack([rates[:, 0], *integrate_speeds(*rates.T), rates[:, 1:]])
-
-
-def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dead reckoning of speeds (T,): x, y and yaw that an odometry would report that only logged its wheels."""
-    dt = np.diff(t)
-    turn = (omega[1:] + omega[:-1]) / 2 * dt
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
-    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
-            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)

@@ -83,6 +83,16 @@ def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]] | None:
     return (left, right) if left and right else None
 
 
+def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Dead reckoning of speeds (T,): x, y and yaw that an odometry would report that only logged its wheels."""
+    dt = np.diff(t)
+    turn = (omega[1:] + omega[:-1]) / 2 * dt
+    yaw = np.concatenate([[0.0], np.cumsum(turn)])
+    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
+    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
+            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)
+
+
 def _odometry(t: np.ndarray, angles: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
     """Odometry (T, 5) of wheel angles (T, 2) that do not wrap."""
     left, right = (wheel_radius * angles).T

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.coverage import CHECK
 from sysid.logs.metrics import METRICS, UNITS
+from sysid.logs.records import CHECK
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
 from whill_mjx.io.html import (

@@ -393,17 +393,19 @@ def form_curves(result: Result) -> dict[str, list[dict[str, Any]]]:
 
 def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
     """Smallest size of each effect that these drives would show with 80 % power, in its parameters' units, and the
-    share of simulated days on which it is noticed there."""
-    found = result.search
-    limit = float(np.quantile(found.scan.null.max(1), 1 - result.config.thresholds.alpha))
+    share of simulated days on which the scan notices it there. The verdict asks for more where days differ by more."""
+    found, priors = result.search, result.config.thresholds
+    least = 0.0 if found.findings is None else found.findings.least_gain(priors)
+    limit = float(np.quantile(found.scan.null.max(1), 1 - priors.alpha))
     solver = Solver(result.evidence)
     base = base_values(result.full)
-    done, tried = set(), []
+    done, tried, enough = set(), [], []
     for columns, wander in zip(result.evidence.columns, result.prepared.wander.covariance, strict=True):
         one = result.hypotheses[columns.hypothesis]
         for position, (axis, index) in enumerate(zip(one.axes, columns.index, strict=True)):
-            variance = 1 / float(solver.information((index,))[0, 0]) + wander[position, position]
-            q = (np.sqrt(limit) + 0.84) * np.sqrt(variance)
+            information = float(solver.information((index,))[0, 0])
+            q = (np.sqrt(limit) + 0.84) * np.sqrt(1 / information + wander[position, position])
+            q = max(q, (np.sqrt(least) + 0.84) / np.sqrt(information))
             usable = axis.signed or q <= 1.6 * columns.level or columns.level >= 8.0
             if (one.key, axis.parameter) in done or not usable:
                 continue
@@ -411,9 +413,11 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
             if axis.dependent:
                 continue
             tried.append((one, axis, columns, np.array([q if other is axis else 0.0 for other in one.axes])))
-    shares = smallest(days, result.config.thresholds.alpha, [(columns, q) for _, _, columns, q in tried])
+            enough.append((np.sqrt(least) + 0.84) / np.sqrt(information) / q)
+    shares = smallest(days, priors.alpha, [(columns, q) for _, _, columns, q in tried])
     out = []
-    for (one, axis, _, q), (factor, power) in zip(tried, shares, strict=True):
+    for (one, axis, _, q), (factor, power), weighed in zip(tried, shares, enough, strict=True):
+        factor = max(factor, weighed)
         value, reach = one.values(factor * q, base)[axis.parameter], factor * q.max() <= axis.limit and power >= POWER
         out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
                     "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,

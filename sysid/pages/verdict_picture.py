@@ -37,12 +37,14 @@ def account(findings: Findings, priors: Thresholds) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for i in list(best.values())[:SHOWN]:
         one = findings.sets[i]
-        rows.append({"name": " and ".join(spoken(name) for name in one.effects), "share": findings.named(one, priors),
+        joined = (" and " if len(one.effects) < 3 else ", ").join(spoken(name) for name in one.effects)
+        rows.append({"name": joined, "share": findings.named(one, priors),
                      "weight": judged.weights.get(" + ".join(one.effects), 0.0),
                      "outcome": _outcome(findings, priors, judged, i)})
     for key, name in (("none", "nothing"), ("noise", "nothing but other noise"), ("unknown", "something unknown")):
         if key in judged.weights:
-            rows.append({"name": name, "share": None, "weight": judged.weights[key], "outcome": ""})
+            kept = f"keeps {priors.alpha:.1%} or more" if judged.verdict == "none" and key != "unknown" else ""
+            rows.append({"name": name, "share": None, "weight": judged.weights[key], "outcome": kept})
     return {"verdict": judged.verdict, "reason": judged.reason, "alpha": priors.alpha, "least_share": priors.share,
             "looks": {name: p for name, p in looks.items() if p is not None}, "explanations": rows}
 
@@ -56,8 +58,10 @@ def _outcome(findings: Findings, priors: Thresholds, judged: Posterior, number: 
         return "tried to check the others"
     if max(one.p) >= priors.alpha:
         return "may be another form of the other" if len(one.effects) > 1 else "may be chance"
-    if not findings.own(one, priors):
-        return "is wrong about other manoeuvres"
+    if not findings.able(one, priors):
+        return "is wrong about other manoeuvres" if min(one.foretold) <= 0 < len(one.effects) - 1 else "adds too little"
+    if judged.verdict == "none":
+        return "no more than days differ by"
     if number != judged.chosen:
         return "explains less" if len(one.effects) == 1 else "weighs less"
     return "named" if judged.verdict == "named" else "explains too little"
@@ -102,7 +106,7 @@ def _explanations(rows: Sequence[Mapping[str, Any]], least: float, top: int) -> 
              _text(MIDDLE, top + 8, "posterior weight", size=10)]
     for number, one in enumerate(rows):
         y = top + 17 + ROW * number
-        colour = BLUE if one["outcome"] in ("named", "") else GREY
+        colour = BLUE if one["share"] is None or one["outcome"] == "named" else GREY
         parts += [_text(LEFT - 10, y + 12, one["name"], "end"), _text(WORDS, y + 12, one["outcome"])]
         if one["share"] is not None:
             parts += [_bar(LEFT, y, long * one["share"], colour, f"{one['share']:.0%}")]

@@ -95,10 +95,10 @@ class CourseReplay:
             size = max(len(values), 2 * values.shape[1] + 1)  # a single one and a Jacobian's are compiled together
             return self._spread(self._replay.simulate(values, size), motion=True)
         sets, courses = len(values), self.courses
-        paths: Any = self.paths(np.repeat(values, courses, axis=0), self._replay.batch, np.tile(np.arange(courses), sets))
+        paths = self.paths(np.repeat(values, courses, axis=0), self._replay.batch, np.tile(np.arange(courses), sets))
         paths = paths.reshape(sets, courses, *paths.shape[1:])
         turned = paths[..., TURN] if self._replay.batch.gyro_index is not None else None
-        path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)
+        path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)  # type: ignore[arg-type]
         return self._spread(path, motion=True)
 
     def traced(self, values: jax.Array) -> Simulated:

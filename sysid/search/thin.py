@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
 from sysid.errors.space import Space
-from sysid.logs.coverage import Excitation, excitation
 from sysid.logs.records import Log, Trial
 
 LEAST_SECONDS = 2.0  # s of commanded motion that a log must have
@@ -30,10 +29,9 @@ REMEDIES = {"no outside pose": "log motion capture, lidar or RTK", "no turn": "t
 
 def causes(trials: Sequence[Trial]) -> list[str]:
     """Which of `HIDDEN` hold for the training trials."""
-    found: list[Excitation] = [excitation(trial) for trial in trials]
     holds = {"no outside pose": all(trial.ground_truth is None for trial in trials),
-             "no turn": not any(abs(bound) > TURNS for one in found for bound in one.omega),
-             "no straight motion": not any(abs(bound) > DRIVES for one in found for bound in one.v)}
+             "no turn": not any((abs(trial.command.omega) > TURNS).any() for trial in trials),
+             "no straight motion": not any((abs(trial.command.v) > DRIVES).any() for trial in trials)}
     return [cause for cause, true in holds.items() if true]
 
 

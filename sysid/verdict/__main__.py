@@ -21,16 +21,14 @@ class Options:
     files: tuple[Path, ...]
     """Files evidence.json that sysid.close_loop wrote."""
     alpha: Annotated[float, Range(0, 1, above=True)] = Thresholds.alpha
-    """p-value below which something is missing, and an effect is it."""
+    """Prior odds of an effect, and p-value below which it is more than chance."""
     share: Annotated[float, Range(0, 1)] = Thresholds.share
-    """Least share that effects explain of what can be explained."""
-    doubt: Annotated[float, Range(0, 1)] = Thresholds.doubt
-    """p-value of the search below which something without a name is missing, whatever the excess."""
+    """Share of what can be explained that something unknown is held to explain."""
 
 
 def main(options: Options) -> None:
     """Print the verdict on each file, and the posterior weights."""
-    priors = Thresholds(options.alpha, share=options.share, doubt=options.doubt)
+    priors = Thresholds(options.alpha, share=options.share)
     with refusing():
         if not options.files:
             raise ValueError("FILE: none given. Give evidence.json of a run of sysid.close_loop.")

@@ -17,6 +17,7 @@ POWER = 0.8
 SCATTER = 0.5
 """Standard deviation from manoeuvre to manoeuvre, as a share of the size, that the test should see."""
 RESAMPLES = 2000
+RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -114,25 +115,30 @@ def foretold(fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision
 
     Compared with a fit without them, to the same other manoeuvres. Linear, around the joint fit.
     """
-    size = len(fit.u)
+    size, columns = len(fit.u), fit.jacobian.reshape(fit.residual.size, -1)
     index = np.arange(size + part.start, size + part.stop)
-    kept = np.delete(np.arange(fit.jacobian.shape[-1]), index)
-    matrix = with_prior(fit, precision)
-    columns, gains = fit.jacobian, []
-    without = fit.residual + columns[..., index] @ fit.q[part]
-    moments = np.einsum("bni,bn->bi", columns, fit.residual)
-    moments_without = np.einsum("bni,bn->bi", columns[..., kept], without)
+    kept = np.delete(np.arange(columns.shape[1]), index)
+    prior = np.zeros((columns.shape[1],) * 2)
+    prior[:size, :size] = precision
+    without = fit.residual + fit.jacobian[..., index] @ fit.q[part]
+    return (left_out(columns[:, kept], prior[np.ix_(kept, kept)], without, groups)
+            - left_out(columns, prior, fit.residual, groups))
+
+
+def left_out(design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: Sequence[Sequence[int]]) -> np.ndarray:
+    """(G,) what columns (n, F) with precision (F, F), fitted to the other manoeuvres, leave of the squares of each
+    manoeuvre in a target (B, n / B)."""
+    flat, columns, out = target.reshape(-1), design.reshape(len(target), -1, design.shape[1]), []
+    matrix, right = design.T @ design + prior, design.T @ flat
     for group in groups:
-        chosen = list(group)
-        flat = columns[chosen].reshape(-1, columns.shape[-1])
-        rest = matrix - flat.T @ flat
-        others = np.setdiff1d(np.arange(len(columns)), chosen)
-        step = np.linalg.solve(rest, moments[others].sum(0))
-        step_without = np.linalg.solve(rest[np.ix_(kept, kept)], moments_without[others].sum(0))
-        left = fit.residual[chosen].reshape(-1) - flat @ step
-        left_without = without[chosen].reshape(-1) - flat[:, kept] @ step_without
-        gains.append(float(left_without @ left_without - left @ left))
-    return np.array(gains)
+        x, y = columns[list(group)].reshape(-1, design.shape[1]), target[list(group)].reshape(-1)
+        out.append(float(np.square(y - x @ solved(matrix - x.T @ x, right - x.T @ y)).sum()))
+    return np.array(out)
+
+
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution of equations that may be dependent."""
+    return np.linalg.solve(matrix + RIDGE * max(float(np.trace(matrix)), 1e-9) * np.eye(len(matrix)), right)
 
 
 def beside(products: np.ndarray, count: int) -> np.ndarray:

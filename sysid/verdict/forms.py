@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sysid.missing.joint_fit import Refit, Replays, without_each
+from sysid.verdict.agreement import left_out, solved
 
 MOST = 2.0
 """Largest size of a modulation: it is 1 at the 90 % quantile of the speed."""
@@ -24,7 +25,6 @@ POINTS = 41
 """Points of a curve over one of them."""
 CONFIDENCE = 1.96
 """Standard deviations to the ends of a 95 % band."""
-RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Forms:
             columns = [self.base, *others, *mine]
             solution, design = self._solved(columns, bent, form, target)
             costs.append(float(target @ target - target @ design @ solution))
-            apart.append(self._left_out(design, self._prior(columns, bent, form), target, groups))
+            apart.append(left_out(design, self._prior(columns, bent, form), target.reshape(self.shape), groups))
         return max(costs[0] - costs[1], 0.0), apart[0] - apart[1]
 
     def deviations(self, form: float, number: int, noise: float = 1.0) -> list[Deviation]:
@@ -106,7 +106,7 @@ class Forms:
         """
         columns, before = [self.base, *self.sizes], sum(one.shape[1] for one in self.bent[:number])
         solution, design = self._solved(columns, self.bent, form, self.target)
-        covariance = _solve(design.T @ design + self._prior(columns, self.bent, form), np.eye(design.shape[1])) * noise
+        covariance = solved(design.T @ design + self._prior(columns, self.bent, form), np.eye(design.shape[1])) * noise
         start = first = sum(one.shape[1] for one in columns) + before
         out = []
         for (name, unit), (low, high), scale, middle in zip(
@@ -131,22 +131,7 @@ class Forms:
                 ) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients (F,) of least cost, and the columns (n, F)."""
         design = np.concatenate([*plain, *bent], axis=1)
-        return _solve(design.T @ design + self._prior(plain, bent, form), design.T @ target), design
-
-    def _left_out(self, design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: Sequence[Sequence[int]]
-                  ) -> np.ndarray:
-        """(G,) squared residual of each manoeuvre, with coefficients fitted to the others."""
-        matrix, right, out = design.T @ design + prior, design.T @ target, []
-        columns, aim = design.reshape(self.shape[0], -1, design.shape[1]), target.reshape(self.shape[0], -1)
-        for group in groups:
-            x, y = columns[list(group)].reshape(-1, design.shape[1]), aim[list(group)].reshape(-1)
-            out.append(float(np.square(y - x @ _solve(matrix - x.T @ x, right - x.T @ y)).sum()))
-        return np.array(out)
-
-
-def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solution of equations that may be dependent."""
-    return np.linalg.solve(matrix + RIDGE * max(float(np.trace(matrix)), 1e-9) * np.eye(len(matrix)), right)
+        return solved(design.T @ design + self._prior(plain, bent, form), design.T @ target), design
 
 
 def forms_of(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:

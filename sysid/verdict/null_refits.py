@@ -82,7 +82,7 @@ def checked(found: Search, nulls: NullRefits, wander: Wander, thresholds: Thresh
         found.verdict, found.accepted, found.classes, found.final = "none", [], [], found.base
         found.share, found.excess = 0.0, (found.excess[0], found.excess[0])
         if found.findings is not None:
-            found.findings = replace(found.findings, p_refit=nulls.p_of(found.p_value), sets=())
+            found.findings = replace(found.findings, sets=())
             found.weights = posterior(found.findings, thresholds).weights
         found.reason = f"stands out no more than in {nulls.p_of(found.p_value):.1%} of simulated days without anything"
     return found

@@ -7,8 +7,9 @@ a saved file can be judged again, with other priors too (`python -m sysid.verdic
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from whill_mjx.io.formats import FORMATS, stamp, upgraded
 from whill_mjx.io.reading import read_json
 
 NOTHING = "nothing stands out of the noise and the day-to-day spread"
+UNSURE = "what stands out outweighs neither the noise nor what days differ by"
 KIND = "sysid-evidence"
 AGAIN = "Give evidence.json of a run of sysid.close_loop."
 MOST = 2
@@ -31,17 +33,14 @@ class Thresholds:
     """What decides. Frozen before any drive is looked at; part of the manifest."""
 
     alpha: float = 0.005
-    """Family-wise p-value below which something is missing, and below which an effect is it: of the excess, of each of
-    the three rounds and of the scan of pairs alike, so that the five together raise at most five times as many false
-    alarms. Of two effects the one whose posterior weight is a smaller share of the other's is not in its class."""
+    """Prior odds of each effect, and of something unknown, against nothing; and the family-wise p-value below which a
+    scan is worth a refit and an effect more than chance. Of two effects the one whose posterior weight is a smaller
+    share of the other's is not in its class."""
     form: float = 0.5
     """Standard deviation of an effect's form from the catalogue's law, as a share of its size."""
     share: float = 0.6
-    """Least share that effects explain of what they explain and what is then left that replicates share, or that smooth
-    functions predict."""
-    doubt: float = 1e-10
-    """p-value of the search below which something without a name is missing, whatever the excess. Small p-values come
-    more often than they should: on 420 days with nothing missing the least one without such an excess was 8e-10."""
+    """Share of what effects explain, and of what they leave though replicates share it or smooth functions predict it,
+    that something unknown is held to explain: with less than that, effects weigh less than the unknown."""
 
     @property
     def alike(self) -> float:
@@ -80,8 +79,6 @@ class TriedSet:
     """By how much they lower the cost of the base fit."""
     p: tuple[float, ...]
     """Of each effect beside other forms of the others, family-wise; what these forms leave counts as noise."""
-    p_value: float
-    """Of "nothing is missing", where this set is taken for what is missing."""
     left: Left
     own: tuple[float, ...]
     """By how much each effect lowers the cost beside other forms of the others."""
@@ -108,8 +105,6 @@ class Findings:
     """Of the scan of effects."""
     p_pairs: float | None
     """Of the scan of pairs; None where there was none."""
-    p_refit: float
-    """Of "nothing is missing": the scan's, or that of the best refit where it is larger."""
     count: float
     """Squared white residual where nothing is missing."""
     trials: int
@@ -167,17 +162,28 @@ class Findings:
         """Share of what could be predicted that a set explains."""
         return self.share(one.gain, one.left, priors.form**2, priors.alpha)
 
-    def own(self, one: TriedSet, priors: Thresholds) -> bool:
-        """Whether every effect of a set does more than to mend the form of the others: it is significant beside these,
-        and the others' manoeuvres foretell it."""
-        return max(one.p) < priors.alpha and (len(one.effects) == 1 or min(one.foretold) > 0)
+    def able(self, one: TriedSet, priors: Thresholds) -> bool:
+        """Whether a set may be named: it is no larger than `MOST`, and every effect does more than to mend the form of
+        the others. Beside these it is significant and outweighs its prior odds, where what all forms leave counts as
+        noise, and the others' manoeuvres foretell it."""
+        noise = 1 + max(one.bent.excess, 0.0)
+        worth = min(self.log_weight(gain / noise, 1, priors) for gain in one.own) > 0
+        known = len(one.effects) == 1 or min(one.foretold) > 0
+        return len(one.effects) <= MOST and max(one.p) < priors.alpha and worth and known
 
     def log_weight(self, gain: float, effects: int, priors: Thresholds) -> float:
-        """Of an explanation: what it gains, in units of what days differ by, less log(1 / alpha) for each effect.
+        """Of an explanation: what it gains, in units of what days differ by, less log(1 / alpha) for each effect."""
+        return gain / self.unit + effects * math.log(priors.alpha)
 
-        Squared residuals of days with nothing missing vary by `day`, as those of 2 / day^2 independent values do.
-        """
-        return gain / max(self.day**2 * self.count, 2.0) - effects * float(np.log(1 / priors.alpha))
+    @property
+    def unit(self) -> float:
+        """Squared residual that is worth 1 of log weight: those of days with nothing missing vary by `day`, as those of
+        2 / day^2 independent values do."""
+        return max(self.day**2 * self.count, 2.0)
+
+    def least_gain(self, priors: Thresholds) -> float:
+        """By how much an effect must lower the cost for nothing to have less than alpha of the weight."""
+        return self.unit * (math.log(1 / priors.alpha - 1) - math.log(priors.alpha))
 
 
 @dataclass(frozen=True)
@@ -196,11 +202,50 @@ class Posterior:
 
 
 def posterior(findings: Findings, priors: Thresholds) -> Posterior:
-    """Weigh what was tried."""
-    verdict, chosen, share, reason = _decide(findings, priors)
-    if verdict == "none" and not findings.sets:
-        return Posterior(verdict, chosen, share, reason, {"noise" if findings.noise else "none": 1.0})
-    return Posterior(verdict, chosen, share, reason, _weights(findings, priors, chosen))
+    """Weigh what was tried: the verdict is where the posterior weight is, and `none` unless nothing has less than
+    `Thresholds.alpha` of it."""
+    chosen = choose(findings, priors)
+    one = None if chosen is None else findings.sets[chosen]
+    nothing, share = _weight_of_nothing(findings, priors, one), 0.0 if one is None else findings.named(one, priors)
+    against = [] if one is None else findings.against.get("+".join(one.effects), [])
+    logs = _log_weights(findings, priors, None if against else one)
+    rest = np.exp(np.array(list(logs.values())) - max(logs.values()))
+    weights = {"noise" if findings.noise else "none": nothing,
+               **dict(zip(logs, ((1 - nothing) * rest / rest.sum()).tolist(), strict=True))}
+    if nothing >= priors.alpha:
+        return Posterior("none", None, 0.0, UNSURE if findings.something(priors) else NOTHING, weights)
+    if one is not None and against:
+        return Posterior("unexplained", chosen, share, contradicted(one.effects, share, against), weights)
+    explains = f"explains {share:.0%} of what can be explained"
+    if max(logs, key=lambda name: logs[name]) != "unknown":
+        return Posterior("named", chosen, share, explains, weights)
+    after = findings.excess if one is None else one.left.excess
+    return Posterior("unexplained", chosen, share,
+                     f"the best of the catalogue {explains}, and {after:.0%} above the noise is left", weights)
+
+
+def _weight_of_nothing(findings: Findings, priors: Thresholds, best: TriedSet | None) -> float:
+    """Posterior weight of nothing missing, against the best set of effects, or against as much as the excess of the
+    error makes likely at most: -1 / (e p log p) (Sellke, Bayarri and Berger 2001)."""
+    p = min(max(findings.p_excess(findings.excess), 1e-300), math.exp(-1))
+    against = -math.log(-math.e * p * math.log(p)) + math.log(priors.alpha)
+    if best is not None:
+        against = max(against, findings.log_weight(best.gain, len(best.effects), priors))
+    return 1 / (1 + math.exp(min(against, 700.0)))
+
+
+def _log_weights(findings: Findings, priors: Thresholds, best: TriedSet | None) -> dict[str, float]:
+    """Of what is missing, if anything: posterior weights of sets of effects, and of something unknown. This gains its
+    share of what can be explained beside the best set."""
+    out: dict[str, float] = {}
+    if best is None:
+        return {"unknown": 0.0}
+    for one in findings.sets:
+        if findings.able(one, priors):
+            name, weight = " + ".join(one.effects), findings.log_weight(one.gain, len(one.effects), priors)
+            out[name] = max(weight, out.get(name, -math.inf))
+    left = findings.predictable(best.left, priors.form**2, priors.alpha)
+    return {**out, "unknown": findings.log_weight(priors.share * (best.gain + max(0.0, *left.values())), 1, priors)}
 
 
 def choose(findings: Findings, priors: Thresholds) -> int | None:
@@ -208,74 +253,15 @@ def choose(findings: Findings, priors: Thresholds) -> int | None:
 
     Every effect of it must be significant and more than another form of the others.
     """
-    able = [i for i, one in enumerate(findings.sets) if len(one.effects) <= MOST and findings.own(one, priors)]
+    able = [i for i, one in enumerate(findings.sets) if findings.able(one, priors)]
     return max(able, key=lambda i: findings.log_weight(findings.sets[i].gain, len(findings.sets[i].effects), priors),
                default=None)
-
-
-def _decide(findings: Findings, priors: Thresholds) -> tuple[str, int | None, float, str]:
-    """Verdict, number of the set, its share, and the reason."""
-    p_excess = findings.p_excess(findings.excess)
-    if not findings.something(priors):
-        return "none", None, 0.0, NOTHING
-    chosen = choose(findings, priors)
-    if chosen is None and p_excess >= priors.alpha:
-        return "none", None, 0.0, "what stands out in a linear scan does not hold in a refit"
-    one = None if chosen is None else findings.sets[chosen]
-    share = 0.0 if one is None else findings.named(one, priors)
-    if one is not None and share >= priors.share:
-        if against := findings.against.get("+".join(one.effects), []):
-            return "unexplained", chosen, share, contradicted(one.effects, share, against)
-        return "named", chosen, share, f"explains {share:.0%} of what can be explained"
-    if not missing(findings.p_refit if one is None else one.p_value, p_excess, priors):
-        return "none", None, 0.0, "what stands out has no name, and days with nothing missing differ by as much"
-    after = findings.excess if one is None else one.left.excess
-    return ("unexplained", chosen, share, f"the best of the catalogue explains {share:.0%} of what can be explained, "
-            f"and {after:.0%} above the noise is left")
 
 
 def contradicted(effects: Iterable[str], share: float, against: Iterable[str]) -> str:
     """Why effects are not named."""
     return (f"{' and '.join(sorted(effects))} would explain {share:.0%} of what can be explained, but "
             f"{'; '.join(against)}")
-
-
-def missing(search_p: float, excess_p: float, thresholds: Thresholds) -> bool:
-    """Whether something without a name is missing: the search and the excess say so, or one of them beyond doubt. The
-    excess alone is one of five looks at the drives."""
-    both = max(search_p, excess_p) < thresholds.alpha
-    return both or excess_p < thresholds.alpha / 5 or search_p < thresholds.doubt
-
-
-def _weights(findings: Findings, priors: Thresholds, chosen: int | None) -> dict[str, float]:
-    """Posterior weights.
-
-    That nothing is missing has at least the weight -e p log p against 1 (Sellke, Bayarri and Berger 2001). The rest is
-    divided by how much each explanation lowers the squared residual, per two units of what days differ by: sets of
-    effects gain what they explain, something unknown all that could be predicted, of which it must be worth
-    `Thresholds.share`. A further effect costs log(1 / alpha).
-    """
-    nothing = "noise" if findings.noise else "none"
-    p = min([findings.p_refit, *(one.p_value for one in findings.sets)] if findings.sets
-            else [findings.p_refit, findings.p_excess(findings.excess)])
-    p = min(max(p, 1e-300), np.exp(-1))
-    bound = -np.e * p * np.log(p)
-    weight = bound / (1 + bound)
-    out = {nothing: float(weight)}
-    able = {i for i, one in enumerate(findings.sets) if len(one.effects) <= MOST and findings.own(one, priors)}
-    names, logs = [], []
-    for i, one in enumerate(findings.sets):
-        if (i in able or i == chosen) and not findings.against.get("+".join(one.effects)):
-            names.append(" + ".join(one.effects))
-            logs.append(findings.log_weight(one.gain, len(one.effects), priors))
-    most = max((one.gain + max(0.0, *findings.predictable(one.left, priors.form**2, priors.alpha).values())
-                for one in findings.sets), default=findings.excess * findings.count)
-    names.append("unknown")
-    logs.append(findings.log_weight(priors.share * most, 1, priors))
-    rest = np.exp(np.array(logs) - max(logs))
-    for name, part in zip(names, (1 - weight) * rest / rest.sum(), strict=True):
-        out[name] = max(out.get(name, 0.0), float(part))
-    return out
 
 
 def as_json(findings: Findings) -> dict[str, Any]:
@@ -289,7 +275,10 @@ def from_json(content: dict[str, Any], where: str = "findings") -> Findings:
     Raises:
         ValueError: if there is a value of another kind, or a set whose lists are not of one length.
     """
-    findings = record(where, Findings, {key: value for key, value in content.items() if key not in ("schema", "kind")})
+    known = _of(Findings, content)  # older files have more
+    if isinstance(sets := known.get("sets"), list):
+        known["sets"] = [_of(TriedSet, one) if isinstance(one, dict) else one for one in sets]
+    findings = record(where, Findings, known)
     for index, one in enumerate(findings.sets):
         lengths = {len(each) for each in (one.effects, one.variants, one.p, one.own, one.foretold, one.classes)}
         if len(lengths) != 1 or 0 in lengths or not all(one.classes):
@@ -299,6 +288,11 @@ def from_json(content: dict[str, Any], where: str = "findings") -> Findings:
         if getattr(findings, name) <= 0:
             raise ValueError(f"{where}: {name} = {shown(getattr(findings, name))} must be above 0.")
     return findings
+
+
+def _of(kind: type, content: dict[str, Any]) -> dict[str, Any]:
+    """The entries of a file that are fields of a record."""
+    return {each.name: content[each.name] for each in fields(kind) if each.name in content}
 
 
 def read(path: Path) -> Findings:

@@ -45,22 +45,18 @@ def settle(asked: Asked, pairs: PairScan | None) -> Search:
     base, wander = asked.base, asked.wander
     excess = asked.excess(base.residual)
     found = Search("none", base, base, asked.scan, excess=(excess, excess), pairs=pairs, reason=NOTHING)
-    findings = Findings(excess, asked.scan.p_family, None if pairs is None else pairs.p_family, asked.scan.p_family,
-                        asked.count, len(base.residual), wander.excess, wander.freedom, wander.usual)
+    findings = Findings(excess, asked.scan.p_family, None if pairs is None else pairs.p_family, asked.count,
+                        len(base.residual), wander.excess, wander.freedom, wander.usual)
     weighed: list[Weighed] = []
     if findings.something(asked.thresholds):
         weighed = _one_by_one(asked, found, findings)
-        findings = _with(findings, found, weighed)
+        findings = replace(findings, sets=tuple(one.numbers for one in weighed))
         if pairs is not None and not findings.settled(asked.thresholds):
             # A single effect had its chance with every other one as a further effect.
             first = {weighed[0].numbers.effects[0]} if len(found.rounds) > 1 else set()
             weighed += [_weighed(asked, members, [[one] for one in members], together)
                         for members, together in pair_round(asked, pairs, first)]
-    return decided(asked, found, _with(findings, found, weighed), weighed)
-
-
-def _with(findings: Findings, found: Search, weighed: Sequence[Weighed]) -> Findings:
-    return replace(findings, p_refit=found.p_value, sets=tuple(one.numbers for one in weighed))
+    return decided(asked, found, replace(findings, sets=tuple(one.numbers for one in weighed)), weighed)
 
 
 def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed]:
@@ -73,7 +69,7 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
         likely = sorted(apart.values(), key=lambda one: -one.gain)  # of several forms of an effect the best one
         new = [_weighed(asked, (*members, one), (*rivals, candidates)) for one in likely[: EFFORT.weighed]]
         out += new
-        able = [one for one in new if findings.own(one.numbers, asked.thresholds)]
+        able = [one for one in new if findings.able(one.numbers, asked.thresholds)]
         if len(members) == 2:
             out += [each for one in new[:1] for each in _without_stand_ins(asked, one)]
         if not able or (asked.p_left(able[0].members[-1].refit.residual) >= asked.thresholds.alpha
@@ -125,7 +121,6 @@ def _weighed(asked: Asked, members: Sequence[Candidate], rivals: Sequence[Sequen
     numbers = TriedSet(
         tuple(one.effect for one in fit.hypotheses), tuple(one.key for one in fit.hypotheses), tuple(fit.q.tolist()),
         asked.base.cost - fit.cost, tuple(p) if len(p) > 1 else (members[0].p,),
-        together if together is not None else max(asked.scan.p_family, min(one.p for one in rivals[0])),
         _left(asked, fit.residual), tuple(gain for gain, _ in own), tuple(interval_of_sum(each)[0] for _, each in own),
         bent,
         tuple(tuple(class_of(asked, one, each)) for one, each in zip(members, rivals, strict=True)))

@@ -42,8 +42,8 @@ def driven(monkeypatch):
     """Folders and seeds of the days that are driven, without driving them."""
     seen = {}
 
-    def drive(path, seed, **_):
-        seen[path] = seed
+    def drive(path, experiment):
+        seen[path] = experiment.seed
         path.mkdir(parents=True)
 
     monkeypatch.setattr(days, "make_log", drive)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bridge.controller import Controller
+from bridge.controller import Caution, Controller
 from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
 
@@ -196,7 +196,7 @@ def test_dark_camera_is_counted_once_per_run_of_frames():
 
 @pytest.mark.parametrize("action, blind_speed", [("warn", 0.4), ("slow", 0.12), ("stop", 0.0)])
 def test_dark_camera_warns_slows_or_stops_as_asked_and_only_while_it_lasts(action, blind_speed):
-    world = World({"on_blind": action})
+    world = World({"caution": Caution(blind=action)})
     world.drive()
     speeds = []
     for i in range(8):  # the frames differ, or they would count as frozen
@@ -243,7 +243,7 @@ def test_compressed_image_is_decoded_and_a_damaged_one_named():
 @pytest.mark.parametrize("action, speeds", [("ignore", (0.4, 0.4, 0.4)), ("slow", (0.4, 0.12, 0.12)),
                                             ("stop", (0.4, 0.12, 0.0))])  # fmt: skip
 def test_surroundings_unlike_the_training_slow_down_and_then_stop_until_an_operator_rearms(action, speeds):
-    world = World({"on_novel": action})
+    world = World({"caution": Caution(novel=action)})
     world.policy.contract.novelty = (10.0, 20.0)
     world.drive()
     for novelty, speed in zip((5.0, 15.0, 25.0), speeds, strict=True):

@@ -80,11 +80,6 @@ def test_second_commander_makes_the_bridge_stand_and_name_it(graph, policy):
     graph.wait_for("drive", "has other publishers: /joystick")
 
 
-def test_missing_camera_is_named(graph, policy):
-    graph.start("drive", policy)
-    graph.wait_for("drive", "no publisher on /sensing/camera/front/image_raw")
-
-
 def test_large_best_effort_images_arrive_with_the_shipped_profile(graph, policy, tmp_path):
     graph.start("drive", policy)
     graph.wait_for("drive", "standing")

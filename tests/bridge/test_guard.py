@@ -1,9 +1,12 @@
 """The guard's decisions and both sides of the heartbeat, with made-up times."""
 
 import json
+import os
+import signal
 
 import pytest
 
+from bridge import ros
 from bridge.guard import GuardLink, Watchdog, read_beat
 
 pytestmark = pytest.mark.quick
@@ -141,3 +144,28 @@ def test_a_guard_that_comes_late_itself_first_reads_what_has_arrived():
     assert not watchdog.tick(1.01) and watchdog.stops == 0
     assert not watchdog.tick(1.04) and not watchdog.tick(1.08) and not watchdog.tick(1.12) and not watchdog.tick(1.15)
     assert watchdog.tick(1.16) and watchdog.stops == 1
+
+
+class Executor:
+    """Serves a node by sending this process a signal."""
+
+    def __init__(self, number):
+        self.number, self.served = number, 0
+
+    add_node = remove_node = lambda self, node: None
+
+    def shutdown(self):
+        self.number = None
+
+    def spin_once(self, timeout_sec):
+        self.served += 1
+        os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_each_signal_leaves_the_spin_so_that_the_node_can_say_goodbye(number, monkeypatch):
+    executor = Executor(number)
+    monkeypatch.setattr(ros, "make_executor", lambda: executor)
+    before = signal.getsignal(number)
+    ros.spin(object(), done=lambda: executor.served > 3)
+    assert executor.served == 1 and executor.number is None and signal.getsignal(number) == before

@@ -3,7 +3,7 @@
 import pytest
 
 from bridge.drive import parse_arguments
-from bridge.parameters import as_options
+from bridge.parameters import with_options
 
 pytest.importorskip("yaml")
 pytestmark = pytest.mark.quick
@@ -22,7 +22,7 @@ other_node:
 
 
 def options(ros_arguments, *own):
-    return parse_arguments(as_options(ros_arguments, "bridge_drive", "policy") + list(own))
+    return parse_arguments(with_options(ros_arguments, "bridge_drive", "policy", list(own)))
 
 
 def test_parameter_file_sets_the_options_of_its_node(tmp_path):

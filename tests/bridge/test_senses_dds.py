@@ -26,11 +26,14 @@ def test_policy_of_two_cameras_a_lidar_and_odometry_drives_the_simulator_until_i
 
 def test_missing_and_wrong_sensors_are_named_and_hold_the_vehicle(graph, sensing):
     robot = graph.peer("robot")
-    robot.whole()
+    robot.base()
+    robot.watch()
+    robot.e_stop()
     robot.publisher("std_msgs/String", "sensing/lidar/scan")
     graph.start("drive", sensing)
     status = robot.wait_for_status(causes="/sensing/lidar/scan carries std_msgs/msg/String, and the policy")
     named = " ".join(robot.wait_for_status(causes="no publisher on /whill/odom, the policy's odometry")["causes"])
     assert "no publisher on /sensing/camera/rear/image_raw, the policy's rear" in named
+    assert "no publisher on /sensing/camera/front/image_raw: start the camera" in named
     assert {"no lidar", "no odometry", "no rear"} <= set(status["holds"]) and not status["driving"]
     assert not robot.commands or not robot.moving()

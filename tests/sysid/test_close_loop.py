@@ -200,7 +200,8 @@ def test_a_simulated_day_that_two_effects_explain_together_is_a_false_alarm(slop
 
     monkeypatch.setattr("sysid.verdict.null_refits.scan_again", lambda first, *_: replace(first, p=np.zeros(1)))
     monkeypatch.setattr("sysid.verdict.search.pair_round", rounds)
-    monkeypatch.setattr(Findings, "named", lambda *_: 1.0)
+    monkeypatch.setattr(Findings, "able", lambda *_: True)
+    monkeypatch.setattr(Findings, "log_weight", lambda *_: 9.0)
     nulls = run_null_refits(asked_of(sloping), settle, sloping.search.pairs, 2)
     assert nulls.alarms == (2 if accepted else 0)
     assert (nulls.p == 1e-4).all() == accepted

@@ -115,6 +115,41 @@ def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp("bags") / "figure_1")
 
 
+def test_files_that_metadata_does_not_name_are_read_without_it(bag, tmp_path):
+    folder = shutil.copytree(bag, tmp_path / "drive")
+    next(folder.glob("*.db3")).rename(folder / "other.db3")
+    log, notes = convert(ConvertConfig(folder, tmp_path / "data"))
+    assert len(log.trials) == 1 and any("what is in other.db3 is read without it" in note for note in notes)
+
+
+def test_topics_that_may_be_meant_are_asked_for_and_speeds_to_the_side_are_named(tmp_path):
+    bag = write_bag(tmp_path / "drive", topics=("/nav/cmd_vel", ODOMETRY, TRUTH), edit=lambda rows: [
+        *rows, *((t, "/joy/cmd_vel", kind, message(kind, linear=vector(y=0.3), angular=vector()))
+                 for t, topic, kind, _ in rows if topic == "/nav/cmd_vel")])
+    with pytest.raises(ValueError, match="any of /joy/cmd_vel, /nav/cmd_vel may be the commands .* --command-topic"):
+        convert(ConvertConfig(bag, tmp_path / "data"))
+    _, notes = convert(ConvertConfig(bag, tmp_path / "data", command_topic="/joy/cmd_vel"))
+    assert any("up to 0.3 m/s sideways" in note for note in notes)
+
+
+def test_joint_states_beside_commands_are_the_odometry(tmp_path):
+    kind = "sensor_msgs/msg/JointState"
+
+    def wheels(rows):
+        made = [row for row in rows if row[1] == COMMAND]
+        for t in np.arange(0.0, 21.0, 0.05):
+            v, omega, *_ = motion(t)
+            made.append((t, "/joint_states", kind, message(
+                kind, header=header(T0 + t), name=["left_wheel", "right_wheel"], position=np.zeros(0),
+                velocity=np.array([v - omega * 0.08, v + omega * 0.08]) / 0.033, effort=np.zeros(0))))
+        return sorted(made, key=lambda row: row[0])
+
+    bag = write_bag(tmp_path / "drive", edit=wheels)
+    log, _ = convert(ConvertConfig(bag, tmp_path / "data", wheel_radius=0.033, track=0.16))
+    odometry = log.trials[0].odometry
+    assert odometry.v.max() == pytest.approx(0.5, abs=1e-3) and odometry.yaw.max() == pytest.approx(6.0, abs=0.1)
+
+
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_a_bag_becomes_a_trial_that_the_loader_accepts(tmp_path, storage):
     write_bag(tmp_path / "circle_1", storage)
@@ -346,7 +381,7 @@ def test_a_bag_joins_a_dataset_that_the_recorder_began(bag, tmp_path):
     write_dataset_file(folder, parse_arguments([str(folder), "straight_1"]))
     for t in np.arange(0.0, 4.0, 0.05):
         writer.command(t, 0.5 * (t > 1), 0.0)
-        writer.odometry(t, 0.5 * max(t - 1, 0), 0.0, 0.0, 0.5 * (t > 1), 0.0)
+        writer.odometry(t, (0.5 * max(t - 1, 0), 0.0, 0.0), (0.5 * (t > 1), 0.0))
     writer.close()
     log, _ = convert(ConvertConfig(bag, folder))
     assert [trial.name for trial in log.trials] == ["figure_1", "straight_1"]

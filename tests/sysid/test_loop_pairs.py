@@ -14,6 +14,7 @@ from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_report import detectable
 from sysid.verdict.found import tail
 from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
+from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import begin
 from sysid.verdict.scan import null_days, run
@@ -72,9 +73,9 @@ def named(found):
 
 
 def test_a_hidden_pair_is_named_and_a_single_effect_stays_one(wander):
-    pair = verdict(drives((0.5, -0.5, 0.0, 0.0), close=0.88), wander)
+    pair = verdict(drives((0.6, -0.6, 0.0, 0.0), close=0.88), wander)
     assert named(pair) == ("named", {"slope", "track_width"})
-    assert pair.scan.p_family > 0.01 > pair.p_value and pair.share > 0.7
+    assert pair.scan.p_family > Thresholds.alpha > pair.p_value and pair.share > 0.7
     assert named(verdict(drives((0.0, 0.0, 1.0, 0.0)), wander)) == ("named", {"side_force"})
     assert named(verdict(drives(np.zeros(4)), wander)) == ("none", set())
 
@@ -136,8 +137,8 @@ def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, mo
     days = simulated_days(evidence, wander, scan)
     monkeypatch.setattr("sysid.pages.loop_report.base_values", lambda _: dict.fromkeys(
         (one.axes[0].parameter for one in EFFECTS), 0.0))
-    result = SimpleNamespace(search=SimpleNamespace(scan=scan), evidence=evidence, hypotheses=EFFECTS, full=None,
-                             prepared=SimpleNamespace(wander=wander),
+    result = SimpleNamespace(search=SimpleNamespace(scan=scan, findings=None), evidence=evidence, hypotheses=EFFECTS,
+                             full=None, prepared=SimpleNamespace(wander=wander),
                              config=SimpleNamespace(thresholds=SimpleNamespace(alpha=0.01)))
     rows = detectable(result, days)
     assert [row["effect"] for row in rows] == [one.effect for one in EFFECTS]

@@ -228,6 +228,29 @@ def test_a_trajectory_without_names_may_have_w_first(tmp_path, order):
     np.testing.assert_allclose(np.unwrap(log.trials[0].ground_truth.yaw), np.unwrap(c["gyaw"]), atol=1e-3)
 
 
+def test_names_in_several_lines_and_counted_frames_are_read(tmp_path):
+    c, none = columns(), 0 * columns()["t"]
+    write(tmp_path / "drive" / "cmd.csv", {name: c[key] for name, key in (("t", "t"), ("v", "cv"), ("w", "cw"))})
+    mocap = write(tmp_path / "drive" / "mocap.csv", {
+        "Frame": c["t"] / 0.1, "RX": none, "RY": none, "RZ": np.rad2deg(c["gyaw"]), "TX": 1e3 * c["gx"],
+        "TY": 1e3 * c["gy"]})
+    head, *rows = mocap.read_text().splitlines()
+    mocap.write_text("\n".join(["Segments", "10", ",robot:body,,,,", head, ",deg,deg,deg,mm,mm", *rows]))
+    with pytest.raises(ValueError, match="If its Frame counts rows, .* time=mocap/Frame:100hz"):
+        convert(ConvertConfig(tmp_path / "drive", tmp_path / "log"))
+    log, _ = convert(ConvertConfig(tmp_path / "drive", tmp_path / "log", columns=("time=mocap/Frame:10hz",)))
+    truth = log.trials[0].ground_truth
+    np.testing.assert_allclose(np.interp(truth.t, c["t"] - c["t"][0], c["gx"]), truth.x, atol=1e-3)
+    turned = "Rotation,Rotation,Rotation,Rotation,Position,Position"
+    parts = quaternion(c["gyaw"])
+    write(mocap, {"t": c["t"], "X": parts["qx"], "Y": parts["qy"], "Z": parts["qz"], "W": parts["qw"], "X ": c["gx"],
+                  "Y ": c["gy"]})
+    head, *rows = mocap.read_text().splitlines()
+    mocap.write_text("\n".join(["," + turned, "Time (Seconds),X,Y,Z,W,X,Y", *rows]))
+    log, _ = convert(ConvertConfig(tmp_path / "drive", tmp_path / "again"))
+    np.testing.assert_allclose(np.unwrap(log.trials[0].ground_truth.yaw), np.unwrap(c["gyaw"]), atol=1e-3)
+
+
 def clocked(c, t):
     return {"time": t, "cmd_v": c["cv"], "cmd_w": c["cw"], "odom_v": c["v"], "odom_w": c["w"]}
 

@@ -140,3 +140,8 @@ def test_a_new_folder_appears_whole_and_leftovers_of_killed_processes_are_remove
     with pytest.raises(FolderRefused, match="exists already"):
         with new_folder(tmp_path / "out"):
             pytest.fail("begun")
+
+
+def test_a_text_with_the_name_of_a_file_that_is_not_utf_8_is_written(tmp_path):
+    write_whole(tmp_path / "page.html", f"of {os.fsdecode(b'caf' + bytes([0xe9]))}, 日本")
+    assert (tmp_path / "page.html").read_text(encoding="utf-8") == "of caf?, 日本"

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, observe, reset_state, step_state
+from whill_mjx.learning.identity import identity_of
+from whill_mjx.learning.setup import find_preset
 from whill_mjx.tasks.map_goal import MapGoal
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.world.collision import obstacles_of, touches
@@ -210,6 +212,20 @@ def test_the_walls_of_a_map_are_stored_once_for_a_batch():
     scene, start = jax.jit(jax.vmap(map_scene_sampler(made)))(jax.random.split(jax.random.key(0), 5))
     assert scene.walls is made.walls and start.shape == (5, 3) and scene.marker.position.shape == (5, 3)
     assert walls.near.max() == 1
+
+
+@pytest.mark.quick
+def test_one_other_cell_of_a_map_makes_another_training(tmp_path):
+    found = []
+    for level in (254, 0):
+        (tmp_path / f"{level}.pgm").write_bytes(b"P5 9 9 255\n" + bytes([level] + [254] * 80))
+        path = tmp_path / f"{level}.yaml"
+        path.write_text(f"image: {level}.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+                        "free_thresh: 0.196\n")
+        task = MapGoal(map=str(path))
+        found.append(identity_of(find_preset("smoke", task), "dreamer", 0, "chair", None)["task_data"])
+        assert found[-1] == task.checksum()
+    assert found[0] != found[1] and "task_data" not in identity_of(find_preset("smoke", "corridor"), "ppo", 0, "", None)
 
 
 def test_a_vehicle_in_a_map_sees_it_and_stops_at_its_walls(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import subprocess
 import sys
@@ -238,3 +239,10 @@ def test_output_that_nobody_reads_ends_the_command_quietly():
         """)
     child.stdout.close()
     assert child.stderr.read() == "" and child.wait() == command_line.UNREAD
+
+
+def test_what_the_terminal_cannot_show_does_not_end_the_work(monkeypatch):
+    shown = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(shown, encoding="ascii"))
+    run(Options, lambda options: print("\u65e5 caf\udce9"), None, args=[])
+    assert shown.getvalue() == b"\\u65e5 caf\\udce9\n"

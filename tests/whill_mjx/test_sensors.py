@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +15,13 @@ import pytest
 from whill_mjx.env import make_env, reset, reset_state, sense, step_state
 from whill_mjx.learning.setup import obs_shape_of
 from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.sensors.camera import Camera
 from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.depth import Depth
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.imu import Imu
 from whill_mjx.sensors.lidar import Lidar, distances
+from whill_mjx.sensors.lidar3d import Lidar3D
 from whill_mjx.sensors.odometry import Odometry
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.world.scene import box, stack_boxes
@@ -165,3 +168,13 @@ def test_the_image_alone_stays_an_array_without_memory():
     state, step = jax.eval_shape(lambda key: reset(env, params, key), jax.random.key(0))
     assert step.obs.shape == (8, 8, 3) and state.sensors == ()
     assert dataclasses.replace(env).sensors == ()
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("kind", [Camera, Depth, Commands, Lidar, Lidar3D])
+def test_no_field_of_a_sensor_takes_what_makes_no_sense(kind):
+    others = ("noise", "as_bytes", "mount")
+    for name in (one.name for one in dataclasses.fields(kind) if not one.kw_only and one.name not in others):
+        for value in (math.nan, math.inf, 1e12, -1e12, "x", True):
+            with pytest.raises(ValueError, match=f"^sensor {kind.__name__}: {name} is "):
+                kind(**{name: value})

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.env import make_env, reset_state, step_state
+from whill_mjx.env import make_env, reset_state, step_state, view_of
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.registry import Registry
 from whill_mjx.learning.setup import find_preset
-from whill_mjx.sensors.base import Reading, Sensor
+from whill_mjx.sensors.base import Reading, Sensor, check_sensor
 from whill_mjx.tasks import tasks
 from whill_mjx.tasks.base import Budget, Task
 from whill_mjx.tasks.corridor import Corridor
@@ -204,12 +204,28 @@ SHAPE, VALUE = "return Reading((2,))", "return memory, view.moment.pose[:2]"
     ("return Reading((2,), low=5, high=-5)", VALUE, "the lower bound"), ("raise KeyError('x')", VALUE, "KeyError"),
     ("return Reading((10**12,))", VALUE, "at most 100000000"), ("return Reading((2,), dtype='x')", VALUE, "TypeError"),
 ])  # fmt: skip
-def test_a_sensor_that_cannot_work_is_named_before_anything_is_compiled(reading, measure, said):
+def test_a_sensor_that_cannot_work_is_named_before_anything_is_compiled(reading, measure, said, seen):
     found = {"Sensor": Sensor, "Reading": Reading, "dataclass": dataclass, "jnp": jnp, "__name__": "mine"}
     exec(SENSOR.format(reading=reading, measure=measure), found)
     with pytest.raises(ValueError, match=f"^sensor 's', Own: .*{said}") as caught:
-        make_env("corridor", observations={"s": found["Own"]()})
+        check_sensor("s", found["Own"](), *seen)
     assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """What a sensor may look at in a state, and the state's shapes."""
+    env, params = make_env("corridor")
+    state = jax.eval_shape(lambda seed: reset_state(env, params, jax.random.key(seed)), 0)
+    return lambda state: view_of(env, params, state), state
+
+
+@pytest.mark.quick
+def test_make_env_checks_sensors_of_others():
+    found = {"Sensor": Sensor, "Reading": Reading, "dataclass": dataclass, "jnp": jnp, "__name__": "mine"}
+    exec(SENSOR.format(reading=SHAPE, measure="return 1"), found)
+    with pytest.raises(ValueError, match="^sensor 's', Own: "):
+        make_env("corridor", observations={"s": found["Own"]()})
 
 
 @pytest.mark.quick

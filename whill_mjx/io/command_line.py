@@ -202,6 +202,8 @@ def guarded(stopped: str = STOPPED) -> Iterator[None]:
     """
     listen()
     _State.working, _State.stopped = True, stopped
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files that are not UTF-8, signs that a terminal lacks
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         yield
         sys.stdout.flush()

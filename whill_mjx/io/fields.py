@@ -146,12 +146,14 @@ def _typed(where: str, hint: Any, value: Any, name: str) -> Any:
         return record(where, hint, value, name)  # type: ignore[arg-type]
     if hint in (int, float):
         return check(where, Field(name, kind="whole" if hint is int else "number"), value)
+    wanted: Any
     wanted, rule = {dict: (dict, "a table"), str: (str, "a text")}.get(origin or hint, ((list, tuple), "a list"))
     if not isinstance(value, wanted):
         raise ValueError(f"{where}: {name} is {shown(value)}; it must be {rule}. Correct it.")
     if hint is str:
         return value
     if origin is dict:
+        assert isinstance(value, dict)
         return {key: _typed(where, inner[1], one, f"{name}.{key}") for key, one in value.items()}
     return origin(_typed(where, inner[0], one, f"{name}[{index}]") for index, one in enumerate(value))
 

@@ -61,9 +61,12 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file, whole or not at all: it gets its name when all of it is on the disk."""
+    """Write a file, whole or not at all: it gets its name when all of it is on the disk.
+
+    A text may hold names of files that are not UTF-8; what cannot be written of them becomes a question mark.
+    """
     with whole_file(path) as temporary:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.write_bytes(content.encode(errors="replace") if isinstance(content, str) else content)
 
 
 def check_place(option: str, path: Path, least_free: int = LEAST_FREE) -> None:
@@ -192,7 +195,7 @@ def read_identity(out: Path, kind: str) -> dict[str, Any] | None:
     try:
         found = read_json(path, "missing.", "")
         there, identity = found["kind"], dict(found["identity"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, OSError, KeyError, TypeError):
         raise FolderRefused(f"--out {out}: {path} does not say which run this is: it is damaged, or of an earlier "
                             "version. Choose another --out.") from None
     if there != kind:

@@ -47,7 +47,8 @@ def identity_of(preset: Preset, learner: str, seed: int, vehicle: str, data: str
         settings["dreamer"] = chosen["learner"]
     known = {"learner": learner, "seed": seed, "task": preset.task.name, "vehicle": vehicle, "data": data}
     source = source_of(preset.task)
-    return known | ({"task_file": source} if source else {}) | dict(_flat(settings))
+    files = {"task_file": source, "task_data": preset.task.checksum()}
+    return known | {name: value for name, value in files.items() if value} | dict(_flat(settings))
 
 
 def vehicle_label(spec: VehicleSpec, params: VehicleParams) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import jax
 
-from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, SHARE, Range, With, check_known
+from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, SHARE, OptionError, Range, With, check_known
 from whill_mjx.learning.setup import TRUTH, Preset, find_preset, with_layout, with_repeat, with_settings
 from whill_mjx.learning.shaping import SAFETY, find_safety
 from whill_mjx.tasks.options import named_task, read_fields
@@ -113,6 +113,7 @@ def choose_preset(options: TrainOptions) -> Preset:
     name = preset_name(options.preset)
     preset = find_preset(name, task, options.steps)
     preset = dataclasses.replace(preset, task=dataclasses.replace(preset.task, **read_fields(task, options.set)))
+    _check_twice(options)
     preset = with_layout(preset, options.layout)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
@@ -145,3 +146,13 @@ def choose_preset(options: TrainOptions) -> Preset:
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
     )
+
+
+def _check_twice(options: TrainOptions) -> None:
+    """Raise OptionError for a setting that has an option of its own and is given by --change or --set too."""
+    for option, texts, names in (("--change", options.change, ("lr", "train_ratio")),
+                                 ("--set", options.set, ("action_repeat",))):  # fmt: skip
+        for text in texts:
+            name = text.partition("=")[0]
+            if name in names and getattr(options, name) is not None:
+                raise OptionError(f"{option} {text}: --{name.replace('_', '-')} gives it too. Leave one out.")

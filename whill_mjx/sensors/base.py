@@ -28,6 +28,18 @@ FIELDS = (
     Field("dropout", "-", 0.0, 1.0),
     Field("noise", "-", 0.0, 1e6),
 )
+IMAGE = tuple(Field(name, "pixels", 1, 4096, kind="whole", needed=False) for name in ("height", "width"))
+"""Sizes of an image; None takes those of the environment."""
+SCAN = (
+    Field("rays", kind="whole", low=1, high=10**5),
+    Field("fov", "rad", 1e-3, 6.2832),
+    Field("reach", "m", 0.01, 1e4),
+    *(Field(name, "m", -100.0, 100.0) for name in ("x", "y", "z")),
+    Field("nearest", "m", 0.0, 1e4),
+    Field("dropouts", "-", 0.0, 1.0),
+    Field("period", "s", 0.0, 10.0),
+)
+"""What laser scanners share."""
 LARGEST = 10**8
 """Numbers that one measurement may have."""
 SLACK = 1e-4
@@ -66,6 +78,8 @@ class Sensor:
     """By which `make_env(observations=...)` finds a sensor of this package."""
     visual: ClassVar[bool] = False
     """Whether it looks through the vehicle's camera, which evaluations move."""
+    ranges: ClassVar[tuple[Field, ...]] = ()
+    """Range of each field of its own."""
     noisy: ClassVar[bool] = False
     """Whether `measure` has put the noise into its value itself."""
     mirrored: ClassVar[Callable[..., jax.Array] | None] = None
@@ -84,7 +98,7 @@ class Sensor:
     """Standard deviation of normal noise, in units of the measurement."""
 
     def __post_init__(self) -> None:
-        check_fields(f"sensor {type(self).__name__}", FIELDS, self)
+        check_fields(f"sensor {type(self).__name__}", (*FIELDS, *self.ranges), self)
 
     def reading(self, env: Any) -> Reading:
         """Shape, type and bounds in an environment."""

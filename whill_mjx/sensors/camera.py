@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from whill_mjx.env import observe
-from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.io.fields import Field
+from whill_mjx.sensors.base import IMAGE, Reading, Sensor, View
 from whill_mjx.vehicle.specs import CameraMount
 
 
@@ -22,6 +23,7 @@ class Camera(Sensor):
 
     name: ClassVar[str] = "camera"
     visual: ClassVar[bool] = True
+    ranges: ClassVar[tuple[Field, ...]] = IMAGE
 
     height: int | None = None
     """Rows; None takes those of the environment."""

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from whill_mjx.io.fields import Field
 from whill_mjx.sensors.base import Reading, Sensor, View
 
 
@@ -17,6 +18,7 @@ class Commands(Sensor):
     """(2 length,) speeds [m/s] and yaw rates [rad/s] commanded in the last steps, the newest first."""
 
     name: ClassVar[str] = "commands"
+    ranges: ClassVar[tuple[Field, ...]] = (Field("length", kind="whole", low=1, high=1000),)
 
     length: int = 1
     """Steps that are remembered; those before the start are zero."""

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.io.fields import Field
+from whill_mjx.sensors.base import IMAGE, Reading, Sensor, View
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.world.maps.walls import shown
 from whill_mjx.world.render import pinhole, render_frame
@@ -21,6 +22,7 @@ class Depth(Sensor):
 
     name: ClassVar[str] = "depth"
     visual: ClassVar[bool] = True
+    ranges: ClassVar[tuple[Field, ...]] = (*IMAGE, Field("reach", "m", 0.01, 1e4))
 
     height: int | None = None
     """Rows; None takes those of the environment."""

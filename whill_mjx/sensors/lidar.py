@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.io.fields import Field
+from whill_mjx.sensors.base import SCAN, Reading, Sensor, View
 from whill_mjx.world.lidar import disturbed, first_hits, sent_from
 from whill_mjx.world.scene import Boxes
 
@@ -25,6 +26,7 @@ class Lidar(Sensor):
     """
 
     name: ClassVar[str] = "lidar"
+    ranges: ClassVar[tuple[Field, ...]] = (*SCAN, Field("yaw", "rad", -6.2832, 6.2832))
     noisy: ClassVar[bool] = True
 
     rays: int = 360

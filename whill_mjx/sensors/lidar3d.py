@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from whill_mjx.sensors.base import Reading, Sensor, View
+from whill_mjx.io.fields import Field
+from whill_mjx.sensors.base import SCAN, Reading, Sensor, View
 from whill_mjx.vehicle.kinematics import rotation_from_quaternion
 from whill_mjx.world.lidar import disturbed, sent_from
 from whill_mjx.world.lidar3d import first_returns
@@ -26,6 +27,10 @@ class Lidar3D(Sensor):
     """
 
     name: ClassVar[str] = "lidar3d"
+    ranges: ClassVar[tuple[Field, ...]] = (
+        *SCAN, Field("rings", kind="whole", low=1, high=1000), Field("lowest", "rad", -1.5708, 1.5708),
+        Field("highest", "rad", -1.5708, 1.5708),
+    )  # fmt: skip
     noisy: ClassVar[bool] = True
 
     rings: int = 16

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.io.fields import BUDGET, TASK, check_fields
+from whill_mjx.io.fields import BUDGET, TASK, Field, check_fields
 from whill_mjx.tasks import terms
 from whill_mjx.tasks.parts import Draws, make_marker, room
 from whill_mjx.tasks.terms import Moment
@@ -88,6 +88,10 @@ class Task:
     """Whether the first boxes are the left, right and far wall of a lane, as `rich` looks need."""
     walls: ClassVar[int] = 4
     """How many of the first boxes of a scene are walls; sweeps move those behind them."""
+    ranges: ClassVar[tuple[Field, ...]] = ()
+    """Range of each field of its own; of two numbers the lower one comes first."""
+    rising: ClassVar[tuple[str, ...]] = ()
+    """Two such fields of which the first is the lower one."""
     per_period: ClassVar[tuple[str, ...]] = ("time",)
     """Reward terms paid in every control period, whatever happens in it. The planner, whose steps are longer than one
     period, scales these."""
@@ -131,7 +135,13 @@ class Task:
             cls.budgets = {}
 
     def __post_init__(self) -> None:
-        check_fields("task", TASK, self)
+        check_fields("task", (*TASK, *self.ranges), self)
+        pairs = {one.name: getattr(self, one.name) for one in self.ranges if one.kind == "numbers" and one.count == 2}
+        if self.rising:
+            pairs[" and ".join(self.rising)] = tuple(getattr(self, name) for name in self.rising)
+        for name, (low, high) in pairs.items():
+            if low > high:
+                raise ValueError(f"task: {name}: {low:g}, {high:g}; the lower number comes first. Correct one.")
         if self.layout not in LAYOUTS:
             raise ValueError(f"layout is {self.layout!r}; use one of {LAYOUTS}.")
         if self.v_max <= self.v_min or self.omega_max <= 0:
@@ -154,6 +164,10 @@ class Task:
         distance, angle = draw(2.0, 4.0, fixed=3.0), draw(-0.8, 0.8, fixed=0.4)
         marker = make_marker(distance * jnp.cos(angle), distance * jnp.sin(angle), size=0.5, height=0.55)
         return World(Scene(room(5.0), marker, default_looks()), jnp.zeros(3))
+
+    def checksum(self) -> str | None:
+        """Checksum of the files that worlds are drawn from: with others, a training is another one. None: no files."""
+        return None
 
     @property
     def crowd(self) -> Crowd:

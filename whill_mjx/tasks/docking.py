@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.io.fields import Field
 from whill_mjx.sensors.base import Reading, Sensor, View
 from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
@@ -39,6 +40,10 @@ class Docking(Task):
     """Stand still within 0.12 m of the dock and within 8 degrees of its direction, between its two cheeks."""
 
     name: ClassVar[str] = "docking"
+    ranges: ClassVar[tuple[Field, ...]] = (
+        Field("heading_tolerance", "rad", 0.0, 3.2), Field("rest_speed", "m/s", 0.0, 20.0),
+        Field("alignment_gain", "1/rad", -1e9, 1e9),
+    )  # fmt: skip
     per_period: ClassVar[tuple[str, ...]] = ("time", "alignment")
     sweeps: ClassVar[tuple[str, ...]] = COMMON_SWEEPS[:1] + COMMON_SWEEPS[3:]
 

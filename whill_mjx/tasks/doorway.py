@@ -8,6 +8,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.io.fields import Field
 from whill_mjx.tasks.base import COMMON_SWEEPS, Task, World
 from whill_mjx.tasks.parts import WALL, lane, make_marker
 from whill_mjx.world.scene import Scene, box, default_looks, stack_boxes
@@ -18,6 +19,9 @@ class Doorway(Task):
     """Drive through a door of 0.85 to 1.0 m, anywhere in a wall across a room, to a marker that is seen through it."""
 
     name: ClassVar[str] = "doorway"
+    ranges: ClassVar[tuple[Field, ...]] = (
+        Field("wall_x", "m", 0.5, 1e3), Field("door", "m", 0.01, 100.0, kind="numbers", count=2),
+    )  # fmt: skip
     looks: ClassVar[str] = "paper"
     lane: ClassVar[bool] = True
     walls: ClassVar[int] = 3

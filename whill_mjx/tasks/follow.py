@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.io.fields import Field
 from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
@@ -39,6 +40,12 @@ class Follow(Task):
     """
 
     name: ClassVar[str] = "follow"
+    rising: ClassVar[tuple[str, ...]] = ("slowest", "fastest")
+    ranges: ClassVar[tuple[Field, ...]] = (
+        Field("keep", "m", 0.01, 100.0), Field("near_reward", "-", -1e9, 1e9), Field("lost_at", "m", 0.01, 1e3),
+        Field("slowest", "m/s", 0.0, 10.0), Field("fastest", "m/s", 0.0, 10.0),
+        Field("pillars", kind="whole", low=0, high=200),
+    )  # fmt: skip
     sweeps: ClassVar[tuple[str, ...]] = COMMON_SWEEPS[:1] + COMMON_SWEEPS[3:]
     budgets: ClassVar[dict[str, Budget]] = {
         "cpu": Budget(

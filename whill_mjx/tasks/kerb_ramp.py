@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.effects.ramp import Ramp
+from whill_mjx.io.fields import Field
 from whill_mjx.tasks.base import COMMON_SWEEPS, Task, World
 from whill_mjx.tasks.parts import lane, make_marker
 from whill_mjx.world.scene import Boxes, Scene, box, default_looks, stack_boxes
@@ -33,6 +34,10 @@ class KerbRamp(Task):
     """
 
     name: ClassVar[str] = "kerb_ramp"
+    ranges: ClassVar[tuple[Field, ...]] = (
+        Field("kerb_x", "m", 0.5, 1e3), Field("cut", "m", 0.01, 100.0, kind="numbers", count=2),
+        Field("rise", "m", 0.001, 2.0, kind="numbers", count=2), Field("run", "-", 0.5, 1e3, kind="numbers", count=2),
+    )  # fmt: skip
     sweeps: ClassVar[tuple[str, ...]] = COMMON_SWEEPS
 
     v_min: float = -0.2

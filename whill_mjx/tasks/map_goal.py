@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -9,11 +10,12 @@ from typing import Any, ClassVar
 
 import jax
 
+from whill_mjx.io.fields import Field
 from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.tasks.base import Task, World
-from whill_mjx.world.maps import Reach, make_map_scene, map_scene_sampler, read_map
+from whill_mjx.world.maps import GridMap, Reach, make_map_scene, map_scene_sampler, read_map
 from whill_mjx.world.maps.several import MapGroup, side_by_side
 from whill_mjx.world.maps.ways import Ways, people_near
 from whill_mjx.world.people.crowd import Crowd, People
@@ -24,6 +26,10 @@ class MapGoal(Task):
     """Drive to a point in a map. Start and goal are drawn anew for each episode; walls are seen, scanned and hit."""
 
     name: ClassVar[str] = "map_goal"
+    rising: ClassVar[tuple[str, ...]] = ("nearest", "farthest")
+    ranges: ClassVar[tuple[Field, ...]] = (
+        Field("nearest", "m", 0.0, 1e4), Field("farthest", "m", 0.01, 1e4),
+    )  # fmt: skip
     walls: ClassVar[int] = 0
 
     v_min: float = 0.0
@@ -46,6 +52,13 @@ class MapGoal(Task):
         scene, start = sample(key if self.randomised else jax.random.key(0))
         return World(scene, start)
 
+    def checksum(self) -> str | None:
+        """Of the maps as they are read."""
+        found = hashlib.sha256()
+        for grid in _grids(self.map):
+            found.update(repr((grid.cells.shape, grid.resolution, grid.origin)).encode() + grid.cells.tobytes())
+        return found.hexdigest()
+
     def populate(self, key: jax.Array, world: World) -> People:
         """People on ways of the map that lead past the start."""
         ways = _ways(self.map, self.nearest, self.farthest, self.people_within)
@@ -56,9 +69,17 @@ class MapGoal(Task):
 
 
 @lru_cache(maxsize=8)
+def _grids(paths: str) -> list[GridMap]:
+    """The maps that are named, commas between them; ValueError says which one cannot be had."""
+    if not all(names := [path.strip() for path in paths.split(",")]):
+        raise ValueError(f"map is {paths!r}: a name is missing. Give a file, or made:SEED for a floor plan of ours.")
+    return [read_map(name) for name in names]
+
+
+@lru_cache(maxsize=8)
 def _made(paths: str, nearest: float, farthest: float) -> MapGroup:
     reach = Reach(nearest=nearest, farthest=farthest)
-    return side_by_side([make_map_scene(read_map(path.strip()), reach) for path in paths.split(",")])
+    return side_by_side([make_map_scene(grid, reach) for grid in _grids(paths)])
 
 
 @lru_cache(maxsize=8)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.io.fields import Field
 from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
@@ -29,6 +30,11 @@ class PointGoal(Task):
     """
 
     name: ClassVar[str] = "point_goal"
+    rising: ClassVar[tuple[str, ...]] = ("nearest", "farthest")
+    ranges: ClassVar[tuple[Field, ...]] = (
+        Field("nearest", "m", 0.0, 1e4), Field("farthest", "m", 0.01, 1e4),
+        Field("boxes", kind="whole", low=0, high=200),
+    )  # fmt: skip
     sweeps: ClassVar[tuple[str, ...]] = COMMON_SWEEPS[:1] + COMMON_SWEEPS[3:]
     budgets: ClassVar[dict[str, Budget]] = {
         "cpu": Budget(

@@ -1,0 +1,165 @@
+"""Which way a pose travels in its own frame, beside the speeds that it should have.
+
+In the vehicle's own frame a pose moves forward by v, and to the left and ahead by what a turn adds at a point beside
+the axle. A regression of both on v and omega shows the angle between the pose's x axis and the way it travels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.logs.records import Trial, command_in_force
+
+GRID_DT, SMOOTHING = 0.02, 0.2  # s between instants, and over which a pose is differenced
+RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
+NONE = 0.02  # m/s, below which a speed is none
+VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
+MOVING = 0.05  # m/s or rad/s of a pose that moves
+WHOLE = 0.8  # share of the motion that a direction, or another clock, must explain
+UNLIKE = 0.3  # of what something does not explain, that may be left with something else
+APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
+SURE = 4.0  # standard errors that an angle or a place must have
+PLAINER = 0.03  # share of the motion that speeds along the vehicle do not explain, where another frame counts
+
+@dataclass(frozen=True)
+class Motion:
+    """A pose's own motion beside the speeds it should have, every GRID_DT."""
+
+    t: np.ndarray  # (G,) s
+    steps: np.ndarray  # (G, 2) m/s, in the fixed frame
+    place: np.ndarray  # (G, 2) m
+    yaw: np.ndarray  # (G,)
+    turn: np.ndarray  # (G,) rad/s
+    v: np.ndarray  # (G,) m/s that it should have
+    omega: np.ndarray  # (G,) rad/s
+
+
+@dataclass(frozen=True)
+class Direction:
+    """Which way a pose travels in its own frame."""
+
+    angle: float
+    """To the left of its own heading [rad]."""
+    error: float
+    explained: float
+    """Share of the motion that this explains."""
+    gain: float = 1.0
+    """Speed of the pose over the one it should have."""
+    gain_error: float = 0.0
+    """Infinite where the tracked point would be too far off."""
+
+
+def motion_of(trial: Trial, name: str) -> Motion | None:
+    """Motion of a stream's pose beside the odometry's speeds, or the commands where there are none that move."""
+    source, odometry = getattr(trial, name), trial.odometry
+    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
+        return None
+    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
+    t = np.arange(source.t[0] + half, source.t[-1] - half, GRID_DT)
+    if len(t) < 50:
+        return None
+
+    def at(when: np.ndarray, column: np.ndarray) -> np.ndarray:
+        return np.asarray(np.interp(when, source.t, column))
+
+    steps, turn = (np.stack([at(t + half, one) - at(t - half, one) for one in columns], axis=-1) / (2 * half)
+                   for columns in ((source.x, source.y), (source.yaw,)))
+    held = command_in_force(trial.command, t - RESPONSE)
+    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
+    if odometry is not None and odometry.v.std() > NONE:
+        shifts = np.linspace(-half, half, 5)
+        v, omega = (np.mean([np.interp(t + shift, odometry.t, one) for shift in shifts], axis=0)
+                    for one in (odometry.v, odometry.omega))
+    if v.std() < VARIED:
+        return None
+    place = np.stack([at(t, source.x), at(t, source.y)], axis=-1)
+    return Motion(t, steps, place, at(t, source.yaw), turn[:, 0], v, omega)
+
+
+def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
+    """Direction in which a pose travels.
+
+    Args:
+        reach: how far from the axle's centre its point may be [m].
+        mirrored: with y negated.
+    """
+    x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
+    cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
+    along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)
+    design = np.column_stack([motion.v, motion.omega])
+    gains = np.linalg.lstsq(design, along, rcond=None)[0]
+    too_far = abs(gains[1]) > reach
+    if too_far:
+        gains[1] *= reach / abs(gains[1])
+        gains[0] = motion.v @ (along - gains[1] * motion.omega) / max(motion.v @ motion.v, 1e-12)
+    left = along - design @ gains
+    power = float(np.square(np.abs(along)).sum())
+    explained = 1 - float(np.square(np.abs(left)).sum()) / max(power, 1e-12)
+    # What v alone shows: on a circle a turned axis and a point before the axle move alike.
+    alone = motion.v - motion.omega * (motion.v @ motion.omega) / max(motion.omega @ motion.omega, 1e-12)
+    independent = max(len(left) * GRID_DT / APART, 1.0)  # samples
+    power_alone, size = independent * max(float(np.mean(np.square(alone))), 1e-12), float(abs(gains[0]))
+    across, ahead = (float(np.sqrt(np.mean(np.square(one)) / power_alone)) for one in (left.imag, left.real))
+    return Direction(float(np.angle(gains[0])), across / max(size, 1e-9), explained, size,
+                     float("inf") if too_far else ahead)
+
+
+def inverted(motion: Motion) -> Motion:
+    """The same motion if the pose is that of the fixed frame in the vehicle's."""
+    cos, sin, half = np.cos(motion.yaw), np.sin(motion.yaw), GRID_DT / 2
+    x, y = motion.place.T
+    back = -np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
+    return replace(motion, steps=np.gradient(back, 2 * half, axis=0), place=back, yaw=-motion.yaw, turn=-motion.turn)
+
+
+def far_point(trials: Sequence[Trial], reach: float) -> str:
+    """A sentence on a tracked point that surely is farther from the axle's centre than a vehicle reaches, or none."""
+    motions = [motion for trial in trials if (motion := motion_of(trial, "ground_truth")) is not None]
+    if not motions:
+        return ""
+    design = np.concatenate([np.column_stack([one.v, one.omega]) for one in motions])
+    along = np.concatenate([np.exp(-1j * one.yaw) * (one.steps[:, 0] + 1j * one.steps[:, 1]) for one in motions])
+    gains = np.linalg.lstsq(design, along, rcond=None)[0]
+    left = along - design @ gains
+    spread = np.linalg.pinv(design.T @ design) * np.square(np.abs(left)).mean() * APART / GRID_DT
+    explained = 1 - float(np.square(np.abs(left)).sum() / max(np.square(np.abs(along)).sum(), 1e-12))
+    if explained < WHOLE or abs(gains[1]) - SURE * np.sqrt(spread[1, 1]) < reach or abs(gains[0]) < 1e-9:
+        return ""
+    place = -1j * gains[1] * abs(gains[0]) / gains[0]  # a turn moves a point ahead to the left
+    ways = (f"{abs(place.real):.2f} m {'ahead of' if place.real > 0 else 'behind'}",
+            f"{abs(place.imag):.2f} m to the {'left' if place.imag > 0 else 'right'} of")
+    return (f"ground_truth: its point is {ways[0]} and {ways[1]} the drive-axle centre, farther than the vehicle "
+            f"reaches ({reach:.2f} m). If that is so, state it: sysid.convert takes --truth-ahead {place.real:.2f} "
+            f"--truth-left {place.imag:.2f}; else take the body that is on the vehicle.")
+
+
+def in_fixed_frame(motions: Sequence[Motion]) -> bool:
+    """Whether v follows the motion along one fixed direction, and not that along the vehicle."""
+    fixed, own = [], []
+    for one in motions:
+        cos, sin = np.cos(one.yaw), np.sin(one.yaw)
+        x, y = one.steps.T
+        fixed.append(_explained(one.v, np.column_stack([x, y])))
+        own.append(_explained(one.v, np.column_stack([cos * x + sin * y, -sin * x + cos * y, one.turn])))
+    left, other = 1 - float(np.median(fixed)), 1 - float(np.median(own))
+    return left < min(1 - WHOLE, UNLIKE * other) and other > PLAINER
+
+
+def _explained(signal: np.ndarray, design: np.ndarray) -> float:
+    """Share of a signal's (T,) square that columns (T, C) explain."""
+    left = signal - design @ np.linalg.lstsq(design, signal, rcond=None)[0]
+    return 1 - float(left @ left) / max(float(signal @ signal), 1e-12)
+
+
+def pooled(found: Sequence[Direction]) -> Direction:
+    """The direction of all trials together, each by how well it shows one."""
+    weights = np.array([1 / max(one.error, 1e-4) ** 2 for one in found])
+    each = np.exp(1j * np.array([one.angle for one in found]))
+    angle = float(np.angle((weights * each).sum()))
+    apart = np.angle(each * np.exp(-1j * angle))
+    scatter = float((weights * apart**2).sum() / weights.sum() / max(len(found) - 1, 1))
+    return Direction(angle, float(np.sqrt(max(1 / weights.sum(), scatter))),
+                     float(np.median([one.explained for one in found])))
