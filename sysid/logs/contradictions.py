@@ -17,6 +17,7 @@ from sysid.logs.directions import (
     UNLIKE,
     VARIED,
     WHOLE,
+    Motion,
     direction,
     far_point,
     in_fixed_frame,
@@ -38,7 +39,7 @@ LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside c
 LEFT = {"odometry": 0.5, "commands": UNLIKE}
 """Of what is not alike, what a clock that runs fast may leave, beside what is measured and beside commands."""
 DRIFT = 0.3  # s by which clocks must come apart in a drive to be told from a delay
-FAST, RATE_STEP = 0.2, 0.005  # by which a clock may run fast or slow, and steps of the search
+MOST, FAST, RATE_STEP = 0.15, 0.2, 0.005  # by which a clock may run fast or slow, how far is searched, and its steps
 
 
 def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
@@ -61,9 +62,12 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
     empty = _empty_speeds(trials) if name == "odometry" else []
     if found := constant_columns(name, trials) or frozen(name, trials) or [*jumps(name, trials), *empty]:
         return found
+    motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
+    if name == "odometry" and motions and in_fixed_frame(motions) and not _is_mirrored(motions, reach):
+        return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
+                "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
     if said := running_fast(name, trials, beside) or another_clock(name, trials):
         return [said]
-    motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if not motions:
         return []
     plain = pooled([direction(one, reach) for one in motions])
@@ -72,9 +76,6 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
             WHOLE, plain.explained):
         return [f"{name}: its pose is that of the fixed frame as the vehicle sees it: parent and child are exchanged. "
                 "Invert the transform: (x, y) = -R(-yaw) (x, y), then yaw = -yaw."]
-    if name == "odometry" and in_fixed_frame(motions):
-        return [f"{name}: v is the speed along the fixed x axis, not along the vehicle: the twist is in the frame "
-                "odom. Its pose agrees with the commands; turn the twist by -yaw, into the vehicle's frame."]
     if plain.explained < LITTLE:
         mirrored = pooled([direction(one, reach, mirrored=True) for one in motions])
         if mirrored.explained > WHOLE:
@@ -97,6 +98,13 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
         return [f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
                 f"the vehicle's. Correct them: {remedy}."]
     return []
+
+
+def _is_mirrored(motions: Sequence[Motion], reach: float) -> bool:
+    """Whether a pose travels along its own heading rather with y negated."""
+    mirrored, plain = (pooled([direction(one, reach, mirrored=way) for one in motions]).explained
+                       for way in (True, False))
+    return mirrored > max(WHOLE, plain)
 
 
 def _obeys(trials: Sequence[Trial]) -> bool:
@@ -143,7 +151,7 @@ def running_fast(name: str, trials: Sequence[Trial], beside: str = "commands") -
         return ""
     bend = unlike[k - 1] - 2 * unlike[k] + unlike[k + 1]
     rate = rates[k] + (0.5 * float((unlike[k - 1] - unlike[k + 1]) / bend) if bend > 0 else 0.0) * RATE_STEP
-    if abs(rate) * max(trial.duration for trial in trials) < DRIFT:
+    if abs(rate) > MOST or abs(rate) * max(trial.duration for trial in trials) < DRIFT:
         return ""
     how = f"about {abs(rate):.0%} {'faster' if rate > 0 else 'slower'}"
     return (f"{name}: its clock runs {how} than that of the {beside}: the two come apart by {abs(rate) * 60:.1f} s in "

@@ -124,9 +124,13 @@ def far_point(trials: Sequence[Trial], reach: float) -> str:
     along = np.concatenate([np.exp(-1j * one.yaw) * (one.steps[:, 0] + 1j * one.steps[:, 1]) for one in motions])
     gains = np.linalg.lstsq(design, along, rcond=None)[0]
     left = along - design @ gains
-    spread = np.linalg.pinv(design.T @ design) * np.square(np.abs(left)).mean() * APART / GRID_DT
+    v, omega = design.T
+    alone = omega - v * (v @ omega) / max(v @ v, 1e-12)  # on a circle nothing shows the place
+    spread = np.square(np.abs(left)).mean() * APART / GRID_DT / max(alone @ alone, 1e-12)
+    if alone @ alone < PLAINER * (omega @ omega):
+        return ""
     explained = 1 - float(np.square(np.abs(left)).sum() / max(np.square(np.abs(along)).sum(), 1e-12))
-    if explained < WHOLE or abs(gains[1]) - SURE * np.sqrt(spread[1, 1]) < reach or abs(gains[0]) < 1e-9:
+    if explained < WHOLE or abs(gains[1]) - SURE * np.sqrt(spread) < reach or abs(gains[0]) < 1e-9:
         return ""
     place = -1j * gains[1] * abs(gains[0]) / gains[0]  # a turn moves a point ahead to the left
     ways = (f"{abs(place.real):.2f} m {'ahead of' if place.real > 0 else 'behind'}",
