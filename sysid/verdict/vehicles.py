@@ -19,6 +19,7 @@ from sysid.missing.signatures import base_columns
 from sysid.replay.models import measured_effects, with_effects
 from sysid.replay.records import FreeVehicle
 from sysid.verdict.result import Result
+from whill_mjx.effects import EFFECTS, make_effects
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 
 
@@ -99,8 +100,8 @@ def _to_poses(result: Result, vehicle: Any, names: list[str], iterations: int) -
 def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[Drives, np.ndarray]:
     """Trials as a vehicle replays them, and the values (all,) of its parameters there.
 
-    They go through what was compiled for the search, where the catalogue has all effects of the vehicle; those that the
-    vehicle does not have are neutral.
+    They go through what was compiled for the search, where the catalogue has all effects of the vehicle, or else
+    through one replay for all vehicles of a result; effects that this vehicle does not have are neutral.
     """
     ready, width, values = result.prepared, result.reference.width, base_values(vehicle)
     gyro = result.reference.gyro
@@ -108,10 +109,23 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[
         values = {**base_values(ready.full), **values}
         drives = make_drives(ready.vehicle, trials, width, ready.paths, gyro)
         return drives, np.array([values[name] for name in ready.names])
-    kind = ready.plant, jax.tree.structure(vehicle)
+    vehicle = _with_named(result, vehicle)
+    values, kind = base_values(vehicle), (ready.plant, jax.tree.structure(vehicle))
     drives = make_drives(FreeVehicle(ready.plant, vehicle, tuple(values)), trials, width, ready.others.get(kind), gyro)
     ready.others[kind] = drives.paths
     return drives, np.array(list(values.values()))
+
+
+def _with_named(result: Result, vehicle: Any) -> Any:
+    """The vehicle with the named effects, neutral where it had none, in one order for all vehicles of a result."""
+    have = {effect.name: effect for effect in vehicle.effects}
+    named = result.search.final.hypotheses if result.search.verdict == "named" else ()
+    names = [*have, *(axis.parameter.partition(".")[0] for one in named for axis in one.axes)]
+    first = [effect.name for effect in result.reference.params.effects]
+    later = make_effects(name for name in names if name in EFFECTS and name not in first)
+    order = dict.fromkeys([*first, *(effect.name for effect in later), *have])
+    every = {effect.name: effect for effect in later} | have
+    return type(vehicle)(vehicle.body, tuple(every[name] for name in order if name in every))
 
 
 def refitter_of(result: Result) -> Refitter:

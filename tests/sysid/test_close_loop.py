@@ -479,6 +479,8 @@ def test_vehicles_with_the_same_effects_share_what_was_compiled(sloping):
     assert again.paths is first.paths
     assert moved[list(again.names).index("body.mass")] == pytest.approx(1.5 * mass)
     assert np.abs(again.simulate(moved[None]) - first.simulate(values[None])).max() > 1e-3
+    named, _ = drives_of(sloping, trials, with_effects(wider, ("slope",)))  # that every vehicle of the result may have
+    assert named.paths is first.paths
     other, _ = drives_of(sloping, trials, with_effects(sloping.reference.params, ("axle_pivot",)))
     assert other.paths is not first.paths
 
