@@ -4,7 +4,6 @@ Only functions import rclpy, so the package can be imported, and its pure parts 
 """
 
 import gc
-import importlib
 import json
 import math
 import os
@@ -17,14 +16,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from bridge.scheduling import ask_for_short_slices, set_realtime
-
 # All names are relative, so a namespace or a remapping moves them: two bridges on one graph never share a topic.
 IMAGE_TOPIC = "sensing/camera/front/image_raw"
 GROUND_TRUTH_TOPIC = "ground_truth/odom"
 ODOMETRY_TOPIC = "whill/odom"
 IMU_TOPIC = "imu"
-GOAL_TOPIC = "goal"
 CAMERA_INFO_TOPIC = "sensing/camera/front/camera_info"
 SCAN_TOPIC = "sensing/lidar/scan"
 MAP_TOPIC = "map"
@@ -58,6 +54,16 @@ def use_dds_profile(environment: MutableMapping[str, str] = os.environ) -> str:
             return environment[variable]
     environment[PROFILE_VARIABLES[0]] = str(PROFILE)
     return str(PROFILE)
+
+
+def set_realtime(name: str, priority: int) -> None:
+    """Run this thread, and those it starts, before all normal processes; say so where not permitted."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, ValueError) as error:
+        print(f"{name}: --realtime {priority}: {error}. It needs a priority from 1 to 99 and the right to use it. "
+              "Run `setcap cap_sys_nice=ep` on the interpreter or raise rtprio in limits.conf; going on without.",
+              file=sys.stderr)
 
 
 def best_effort(depth: int = 1) -> Any:
@@ -132,12 +138,6 @@ def subscribe_counting_losses(node: Any, topic: Topic, callback: Callable[[Any],
     except UnsupportedEventTypeError:
         events = subscription_events(**callbacks)
         return node.create_subscription(topic.kind, topic.name, callback, topic.profile, event_callbacks=events, **more)
-
-
-def message_type(kind: str) -> Any:
-    """Return the class of a message such as sensor_msgs/LaserScan."""
-    package, _, name = kind.partition("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 def is_reliable(policy: Any) -> bool:
@@ -272,7 +272,6 @@ def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bo
     """
     if realtime:
         set_realtime(name, realtime)
-    ask_for_short_slices()
     use_dds_profile()
     try:
         import rclpy
