@@ -4,6 +4,7 @@ Only functions import rclpy, so the package can be imported, and its pure parts 
 """
 
 import gc
+import importlib
 import json
 import math
 import os
@@ -21,6 +22,7 @@ IMAGE_TOPIC = "sensing/camera/front/image_raw"
 GROUND_TRUTH_TOPIC = "ground_truth/odom"
 ODOMETRY_TOPIC = "whill/odom"
 IMU_TOPIC = "imu"
+GOAL_TOPIC = "goal"
 CAMERA_INFO_TOPIC = "sensing/camera/front/camera_info"
 SCAN_TOPIC = "sensing/lidar/scan"
 MAP_TOPIC = "map"
@@ -138,6 +140,12 @@ def subscribe_counting_losses(node: Any, topic: Topic, callback: Callable[[Any],
     except UnsupportedEventTypeError:
         events = subscription_events(**callbacks)
         return node.create_subscription(topic.kind, topic.name, callback, topic.profile, event_callbacks=events, **more)
+
+
+def message_type(kind: str) -> Any:
+    """Return the class of a message such as sensor_msgs/LaserScan."""
+    package, _, name = kind.partition("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 def is_reliable(policy: Any) -> bool:
