@@ -36,7 +36,7 @@ from whill_mjx.io.folders import check_place, whole_file, write_whole
 from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.options import named_task, read_fields
-from whill_mjx.tasks.tasks import LAYOUTS, TASKS
+from whill_mjx.tasks.tasks import LAYOUTS, TASKS, Task
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.gallery import gallery, walk
@@ -264,6 +264,15 @@ def record(options: Look) -> int:
     return int(state.step_count)
 
 
+def _missing(task: Task) -> str:
+    """What a task cannot be drawn without, such as a map; nothing for most."""
+    try:
+        check_world(task)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
 def main(options: Look) -> None:
     """Write the sheet or the video of `options`."""
     known = (*TASKS, "gallery")
@@ -283,6 +292,9 @@ def main(options: Look) -> None:
     check_place("--out", options.out)
     if options.scene == "all":
         for name in known:
+            if name in TASKS and (missing := _missing(TASKS[name])):
+                print(f"{name}: left out. {missing}")
+                continue
             out = options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
             main(dataclasses.replace(options, scene=name, out=out))
         return
@@ -299,12 +311,10 @@ def main(options: Look) -> None:
         write_video(options.out, frames, options.scale)
         print(f"{options.out}: {len(frames)} frames of {options.scene}")
         return
+    seen = None if options.scene == "gallery" else _env(options)
     with Heartbeat() as heartbeat:
         heartbeat.stage(f"drawing {options.scene}: half a minute, most of it compilation")
-        if options.scene == "gallery":
-            sheet = gallery_sheet()
-        else:
-            sheet = contact_sheet(*_env(options), options.worlds, options.steps, options.seed)
+        sheet = gallery_sheet() if seen is None else contact_sheet(*seen, options.worlds, options.steps, options.seed)
     write_png(options.out, sheet.repeat(options.scale, 0).repeat(options.scale, 1))
     print(f"{options.out}: {options.scene}")
 

@@ -9,11 +9,15 @@ import mujoco
 import numpy as np
 
 from sysid.replay.robot import Robot
+from sysid.replay.robot_contacts import radius_of
 from sysid.replay.robot_drive import RAMP, SECONDS, SPIN, RobotDrive
 
 ALONE = 0.999  # of the weight on two wheels, from which nothing else carries a robot
 STRAIGHT = 0.1  # share by which the speed may differ from the command
-TURNS = 0.8  # share of the commanded rate on the spot, below which something keeps a robot from turning
+TURNS = 0.75  # share of the commanded rate on the spot, below which something keeps a robot from turning
+DENSE = 20_000.0  # kg/m^3, of the box around a robot: gold
+ACROSS = 0.5  # of an axis across the vehicle, below which a wheel does not roll ahead
+ALIKE = 0.01  # share by which radii of wheels may differ
 LIGHT = 0.02  # share of the weight below which what touches the floor is not listed
 
 
@@ -119,6 +123,9 @@ def _missing(robot: Robot, check: Check) -> list[str]:
     carried = sum(share for name, share in check.loads.items()
                   if int(host.body_weldid[host.geom_bodyid[host.geom(name).id]]) in
                   {int(host.body_weldid[body]) for body in wheels})
+    if (density := _density(robot)) > DENSE:
+        found.append(f"it is as heavy as {density:.2g} kg in each cubic metre around it: masses are in kg, not in "
+                     "grams")
     if carried < 0.3:
         found.append(f"the driven wheels carry {carried:.0%} of the weight: they may spin. Check the heights of "
                      "casters and wheels, and the centre of mass")
@@ -137,10 +144,33 @@ def _missing(robot: Robot, check: Check) -> list[str]:
     return found
 
 
+def _density(robot: Robot) -> float:
+    """Mass over the volume of the box around a robot's geoms [kg/m^3]."""
+    host, data = robot.host, mujoco.MjData(robot.host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_kinematics(host, data)
+    root = int(host.body_rootid[host.jnt_bodyid[_joints(robot)[0]]])
+    mine = host.body_rootid[host.geom_bodyid] == root
+    place, size = data.geom_xpos[mine], host.geom_rbound[mine, None]
+    volume = float(np.prod((place + size).max(0) - (place - size).min(0)))
+    return float(host.body_subtreemass[root]) / max(volume, 1e-12)
+
+
 def _limits(robot: Robot, v: float) -> list[str]:
     """What of the driven wheels' joints and actuators may keep a robot from a speed [m/s]."""
     host, found = robot.host, []
-    for joint in _joints(robot):
+    data = mujoco.MjData(host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_kinematics(host, data)
+    joints = _joints(robot)
+    across = np.cross([0.0, 0.0, 1.0], _forward(robot, data, int(host.body_rootid[host.jnt_bodyid[joints[0]]])))
+    found += [f"the axis of joint {host.joint(one).name} does not lie across the vehicle (URDF's default is 1 0 0)"
+              for one in joints if abs(float(data.xaxis[one] @ across)) < ACROSS]
+    radii = [radius_of(robot.path, host, int(host.jnt_bodyid[one])) for one in joints]
+    if max(radii) > (1 + ALIKE) * min(radii):
+        found.append("the radii of its wheels differ: " + ", ".join(
+            f"{host.joint(one).name} {radius:.4g} m" for one, radius in zip(joints, radii, strict=True)))
+    for joint in joints:
         if host.jnt_actfrclimited[joint]:
             found.append(f"joint {host.joint(joint).name} gives at most {host.jnt_actfrcrange[joint, 1]:.3g} N m "
                          "(effort, or actuatorfrcrange)")

@@ -71,12 +71,18 @@ def reach_of(host: mujoco.MjModel, body: int) -> float:
 
 
 def _corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Points (K, 3) of a geom in its own frame: vertices of a mesh, corners of a box, the middle of a ball."""
+    """Points (K, 3) of a geom in its own frame: vertices of a mesh, corners of a box, the middle of a ball, the surface
+    of an ellipsoid."""
     kind, mesh = int(host.geom_type[geom]), int(host.geom_dataid[geom])
     if kind == int(mujoco.mjtGeom.mjGEOM_MESH):
         first = int(host.mesh_vertadr[mesh])
         return np.asarray(host.mesh_vert[first : first + int(host.mesh_vertnum[mesh])], float)
     signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)], float)
+    if kind == int(mujoco.mjtGeom.mjGEOM_ELLIPSOID):
+        around, up = (one.ravel() for one in np.meshgrid(np.arange(0, 360, 10), np.arange(-90, 91, 10)))
+        flat = np.cos(np.radians(up))
+        signs = np.column_stack([flat * np.cos(np.radians(around)), flat * np.sin(np.radians(around)),
+                                 np.sin(np.radians(up))])
     size = np.array(host.geom_size[geom], float)
     if kind in map(int, ROUND):
         size = np.array([0.0, 0.0, 0.0 if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE) else size[1]])
@@ -91,7 +97,7 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
         radius, one = reach_of(host, body), spec.body(host.body(body).name)
         solid = max((float(host.geom_size[geom, 0]) for geom in np.flatnonzero(host.geom_bodyid == body)
                      if int(host.geom_type[geom]) in map(int, ROUND)), default=0.0)
-        rollers = any(joint.parent.name != one.name for joint in one.find_all("joint")) and radius > ROLLED * solid
+        rollers = radius > ROLLED * solid and any(joint.parent.name != one.name for joint in one.find_all("joint"))
         if solid > 0.0 and not rollers or radius == 0.0:
             continue
         if not one.explicitinertial:
@@ -104,7 +110,8 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
         one.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0.0, 0.0], contype=0, conaffinity=1, mass=0.0,
                      pos=host.jnt_pos[host.body_jntadr[body]], solref=FIRM_TIME, solimp=FIRM, solmix=ALONE,
                      name=one.name)
-        what = "has rollers, which are left out" if rollers or not shapes else "is no cylinder or sphere"
+        what = "has rollers, which are left out" if rollers else "is no cylinder or sphere" if shapes else (
+            "has its shape on another link")
         notes.append(f"{path.name}: wheel {one.name} {what}: it rolls on the {radius:.4g} m by which it reaches from "
                      "its axle")
     return notes

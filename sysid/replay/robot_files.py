@@ -44,7 +44,8 @@ def read_robot(
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
     """
     text = decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF, URDF or xacro file."))
-    text, left_out = expand_xacro(path) if path.suffix == ".xacro" else (text, [])
+    xacro = path.suffix == ".xacro" or "<xacro:" in text
+    text, left_out = expand_xacro(path) if xacro else (text, [])
     try:
         top = ElementTree.fromstring(text)
     except ElementTree.ParseError:
@@ -54,7 +55,7 @@ def read_robot(
     if top.tag not in ("robot", "mujoco"):
         raise ValueError(f"{path}: it begins with <{top.tag[:40]}>. {OTHER}")
     if top.tag != "robot":
-        spec = mujoco.MjSpec.from_string(text) if path.suffix == ".xacro" else mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_string(text) if xacro else mujoco.MjSpec.from_file(str(path))
         return spec, [*left_out, *_place_meshes(path, spec)], None
     notes = [*left_out, *complete_links(path, top), *_place_urdf_meshes(path, top, wheels, wheel_radius)]
     return mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode")), notes, _frictions(top)

@@ -51,7 +51,7 @@ def load_robot(
         bare = _drive(draft, radius, regulated)
         _ground(draft, radius)
     except (ValueError, KeyError, mujoco.FatalError, mujoco.UnexpectedError) as error:
-        text = str(error).strip()
+        text = " ".join(str(error).split())
         raise ValueError(text if text.startswith(str(path)) else f"{path}: MuJoCo cannot use it: {text}. Correct the "
                          "model.") from None
     host, data, ids = draft.host, draft.data, draft.ids

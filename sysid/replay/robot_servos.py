@@ -45,6 +45,14 @@ def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
             notes.append(f"{path.name}: actuator {one.name} {what}: {instead} stands in for it"
                          .replace("wheels stands", "wheels stand"))
             spec.delete(one)
+    left = [one for one in spec.actuators if one.target in joints]
+    plain = {one.target for one in left if one.dyntype != mujoco.mjtDyn.mjDYN_INTEGRATOR}
+    if left and plain != set(joints):
+        why = "sum up a speed" if not plain else "are not on all of the wheels"
+        notes.append(f"{path.name}: actuators {', '.join(one.name for one in left)} {why}: servos on the wheels stand "
+                     "in for them")
+        for one in left:
+            spec.delete(one)
     return notes
 
 

@@ -73,7 +73,7 @@ def _inertial(link: ElementTree.Element, name: str) -> list[str]:
         if link.find("collision") is None and link.find("visual") is None:
             return []
         link.remove(inertial)
-        return [f"link {name} has a mass of 0: its shape at the density of water gives it"]
+        return [f"link {name} has a mass of {mass:g}: its shape at the density of water gives it"]
     if numbers is None:
         return []
     xx, xy, xz, yy, yz, zz = (_number(numbers, one) for one in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))

@@ -50,7 +50,8 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...
         _refuse_steering(path, spec, hinges, standing)
     pulled = [name for name in hinges if name in driven.values()]
     for among in (pulled, list(hinges)):
-        sides = [[name for name in among if side in name.lower()] for side in ("left", "right")]
+        sides = [[name for name in among if side in name.lower() and _may_roll(hinges[name])]
+                 for side in ("left", "right")]
         if all(len(side) == 1 for side in sides):
             return sides[0][0], sides[1][0]
     rolling = [name for name, joint in hinges.items() if _rolls(joint)]
@@ -147,6 +148,11 @@ def _refuse_steering(path: Path, spec: Any, hinges: Mapping[str, Any], standing:
 def _has_end(joint: Any) -> bool:
     """Whether a hinge turns less than a hundred turns."""
     return bool(0 < np.ptp(joint.range) < MANY_TURNS) and joint.limited != mujoco.mjtLimited.mjLIMITED_FALSE
+
+
+def _may_roll(joint: Any) -> bool:
+    """Whether a hinge has no end, or is of a wheel by its name: fingers have sides too."""
+    return not _has_end(joint) or WHEEL.search(f"{joint.name} {joint.parent.name}") is not None
 
 
 def _rolls(joint: Any) -> bool:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from whill_mjx.look import Look, depth_picture, main, write_png
+from whill_mjx.look import Look, _missing, depth_picture, main, write_png
+from whill_mjx.tasks.tasks import TASKS
 
 
 @pytest.mark.quick
@@ -33,3 +34,8 @@ def test_unknown_scenes_and_endings_are_refused(tmp_path, options, words):
     with pytest.raises(ValueError, match=words):
         main(Look(scene=options.get("scene", "gallery"), out=out))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.quick
+def test_a_task_that_needs_a_map_is_left_out_of_all():
+    assert "a name is missing" in _missing(TASKS["map_goal"]) and not _missing(TASKS["corridor"])
