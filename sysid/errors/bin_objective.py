@@ -51,6 +51,8 @@ class FeatureObjective:
     whitener: Whitener
     prior: Prior | None = None
     """Its P residuals are the last ones of the first trial."""
+    one_sided: bool = False
+    """Whether derivatives are differences to one side: half as many replays."""
 
     @property
     def enough(self) -> bool:
@@ -118,13 +120,13 @@ class FeatureObjective:
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, B, K C) and their derivatives by u (N, B, K C, P): differences over a share of each range."""
-        pairs = Quotients.central(u, STEP)
-        return self._quotients(u, pairs, (pairs.above, pairs.below))
+        pairs = (Quotients.inward if self.one_sided else Quotients.central)(u, STEP)
+        return self._quotients(u, pairs, (pairs.above,) if self.one_sided else (pairs.above, pairs.below))
 
-    def one_sided(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `jacobian`, to one side: half as many replays. Good enough for steps, which are judged by their costs."""
-        pairs = Quotients.inward(u, STEP)
-        return self._quotients(u, pairs, (pairs.above,))
+    @property
+    def rough(self) -> FeatureObjective:
+        """For a search that another follows: on a processor with one-sided derivatives."""
+        return replace(self, one_sided=True) if on_processor() else self
 
     def _quotients(
         self, u: np.ndarray, pairs: Quotients, sides: tuple[np.ndarray, ...]

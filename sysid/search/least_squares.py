@@ -129,8 +129,7 @@ class _Descent:
             costs = self.equations.costs(tried.points.reshape(-1, size), self.robust) / self.objective.counted
             after = self.solver.step(state, tried, costs.reshape(tried.promised.shape))
             return after, state.cost, len(state.u) + len(costs)
-        # Quicker than central differences, where an objective has them.
-        residual, jacobian = getattr(self.objective, "one_sided", self.objective.jacobian)(state.u)
+        residual, jacobian = self.objective.jacobian(state.u)
         first = robust_cost(residual, self.robust) / self.objective.counted
         state, spent = state._replace(cost=first), len(state.u)
         linear = _Linear(np.arange(spent), residual, jacobian, np.ones(spent, bool))

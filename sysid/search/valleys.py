@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -27,6 +26,9 @@ FIRST, KEPT, LOOK = 1, 2, 3
 LAST = 3  # iterations on whole drives at most, after those in pieces of an accelerator
 LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
 WORTH = 0.001  # share of the cost that another valley must save for the floor to be followed from there
+
+Search = Callable[[DriveResiduals, np.ndarray, int], FitResult]
+"""From all of starts (S, P), for so many iterations at most."""
 
 
 def gradient_search(
@@ -57,15 +59,14 @@ def gradient_search(
     result = search(objective, starts, iterations)
     objective, result = renew(objective, result, result.starts)
     progress = stages.begin("checks from other starts") if stages else None
-    follow = partial(search, objective)
     if config.elsewhere:
-        result = _from_ends(follow, objective, result, iterations, config.robust)
+        result = _from_ends(search, objective, result, iterations, config.robust)
     lost = config.elsewhere
     while lost:
         before = result.cost
         costs, points = least_squares.far_points(objective, result.u, robust=config.robust)
         points = points[costs < DEAR * result.cost][:FAR]
-        result = _from_elsewhere(follow, result, points, iterations)
+        result = _from_elsewhere(search, objective, result, points, iterations)
         lost = result.cost < LOST * before
     found = least_squares.profile_delays(objective, result.u, robust=config.robust)
     for name, _, costs, followed in found:
@@ -73,17 +74,16 @@ def gradient_search(
         apart = np.abs(followed[:, index] - result.u[index]) > 1e-6
         if config.elsewhere and costs[apart].min() < result.cost * (1 + VALLEY):
             other = followed[apart][costs[apart].argmin()]
-            result = _from_elsewhere(follow, result, other[None], iterations)
+            result = _from_elsewhere(search, objective, result, other[None], iterations)
     deeper = config.elsewhere
     if deeper:
         given = result
         objective, result = renew(objective, result, result.u[None])
         result = replace(result, starts=given.starts, start_costs=given.start_costs, order=given.order)
-        follow = partial(search, objective)
     while deeper:
         result = slopes.descend(objective, result, config.robust, config.seed, progress)
         floor = result.cost
-        result = _from_ends(follow, objective, result, iterations, config.robust)
+        result = _from_ends(search, objective, result, iterations, config.robust)
         deeper = result.cost < floor * (1 - WORTH)
     return result, objective, [(name, grid, costs) for name, grid, costs, _ in found]
 
@@ -104,31 +104,30 @@ def from_all(
 
 
 def _from_ends(
-    search: Callable[[np.ndarray, int], FitResult], objective: DriveResiduals, result: FitResult, iterations: int,
-    robust: bool,
+    search: Search, objective: DriveResiduals, result: FitResult, iterations: int, robust: bool
 ) -> FitResult:
     """The result with where searches from those ends of ranges lead that cost little. An end that costs what is here
     lies on the same ground, and a search from it hardly leads on: such are tried where there are no others."""
     costs, points = least_squares.ends_of_ranges(objective, result.u, robust=robust)
     near, level = costs < FLAT * result.cost, np.abs(costs - result.cost) <= WORTH * result.cost
     near = near & ~level if (near & ~level).any() else near
-    return _from_elsewhere(search, result, points[near], iterations)
+    return _from_elsewhere(search, objective, result, points[near], iterations)
 
 
 def _from_elsewhere(
-    search: Callable[[np.ndarray, int], FitResult], result: FitResult, starts: np.ndarray, iterations: int
+    search: Search, objective: DriveResiduals, result: FitResult, starts: np.ndarray, iterations: int
 ) -> FitResult:
     """The result with where a search from other starts (S, P) ends, if that is lower: they are followed for a few
     iterations, the best of them to its end where it is lower by then."""
     if not len(starts):
         return result
-    spent = result.evaluations
+    spent, rough = result.evaluations, getattr(objective, "rough", objective)
     if len(starts) > KEPT:
-        first = search(starts, FIRST)
+        first = search(rough, starts, FIRST)
         starts, spent = first.starts[:KEPT], spent + first.evaluations
-    new = search(starts, min(LOOK, iterations))
+    new = search(rough, starts, min(LOOK, iterations))
     spent += new.evaluations
     if new.cost < result.cost:
-        new = search(new.u[None], iterations)
+        new = search(objective, new.u[None], iterations)
         result, spent = replace(result, u=new.u, cost=new.cost, history=new.history), spent + new.evaluations
     return replace(result, evaluations=spent)
