@@ -51,8 +51,6 @@ class FeatureObjective:
     whitener: Whitener
     prior: Prior | None = None
     """Its P residuals are the last ones of the first trial."""
-    one_sided: bool = False
-    """Whether derivatives are differences to one side: half as many replays."""
 
     @property
     def enough(self) -> bool:
@@ -120,25 +118,13 @@ class FeatureObjective:
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (N, B, K C) and their derivatives by u (N, B, K C, P): differences over a share of each range."""
-        pairs = (Quotients.inward if self.one_sided else Quotients.central)(u, STEP)
-        return self._quotients(u, pairs, (pairs.above,) if self.one_sided else (pairs.above, pairs.below))
-
-    @property
-    def rough(self) -> FeatureObjective:
-        """For a search that another follows: on a processor with one-sided derivatives."""
-        return replace(self, one_sided=True) if on_processor() else self
-
-    def _quotients(
-        self, u: np.ndarray, pairs: Quotients, sides: tuple[np.ndarray, ...]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals at u (N, P), and slopes between them and those at points (N, P, P) on one side or on both."""
         count, size = u.shape
-        at = self.simulate(np.concatenate([u, *(points.reshape(-1, size) for points in sides)]))
+        pairs = Quotients.central(u, STEP)
+        at = self.simulate(np.concatenate([u, pairs.above.reshape(-1, size), pairs.below.reshape(-1, size)]))
         white = self._white(at)
-        moved = white[count:].reshape(len(sides), count, size, *white.shape[1:])
-        low = moved[1] if len(sides) == 2 else white[:count, None]
-        lost = _bad(at[:count])[:, None] | _bad(at[count:]).reshape(len(sides), count, size, -1, 1).any(0)
-        slope = np.where(np.moveaxis(lost, 1, -1), 0.0, pairs.slopes(moved[0], low))
+        high, low = white[count:].reshape(2, count, size, *white.shape[1:])
+        lost = _bad(at[:count])[:, None] | _bad(at[count:]).reshape(2, count, size, -1, 1).any(0)
+        slope = np.where(np.moveaxis(lost, 1, -1), 0.0, pairs.slopes(high, low))
         if self.prior is None:
             return white[:count], slope
         known = np.tile(np.diag(self.prior.slope), (count, 1, 1))

@@ -31,12 +31,6 @@ class Quotients:
         return cls(above, below)
 
     @classmethod
-    def inward(cls, x: np.ndarray, sizes: Any) -> Quotients:
-        """About x (..., P), where f is known already, `sizes` (P,) towards the middle of the unit box."""
-        steps = np.where(x > 0.5, -1.0, 1.0)[..., None, :] * sizes * np.eye(x.shape[-1])
-        return cls(x[..., None, :] + steps, np.broadcast_to(x[..., None, :], (*x.shape, x.shape[-1])))
-
-    @classmethod
     def forward(cls, x: np.ndarray, sizes: np.ndarray) -> Quotients:
         """From x (P,), where f is known already, `sizes` (P,) upwards."""
         return cls(x + np.diag(sizes), np.broadcast_to(x, (len(x), len(x))))

@@ -1,8 +1,8 @@
 """Bounded Levenberg-Marquardt from several starts at once.
 
 All starts advance together: each iteration is one batched Jacobian and one batched replay of several damping values per
-start, of which the best is taken; starts that have converged wait. A Jacobian takes a replay for each parameter or two,
-so a few more tries follow without a new one: shorter steps where none helped, and where one brought what it promised,
+start, of which the best is taken; starts that have converged wait. A Jacobian takes two replays for each parameter, so
+a few more tries follow without a new one: shorter steps where none helped, and where one brought what it promised,
 steps that learn what they can of the derivatives from those before (Broyden 1965). Steps are in unit coordinates.
 """
 

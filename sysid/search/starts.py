@@ -46,7 +46,7 @@ def fit(
     Returns:
         The best point; `start_costs` are those of the first fit, ascending.
     """
-    coarse = make_features_objective(objective, track).quicker.rough
+    coarse = make_features_objective(objective, track).quicker
     found = least_squares.fit(coarse, starts=points, stop=least_squares.Stopping(iterations, TOLERANCE),
                               progress=progress)
     fine = coarse.renewed(found.u)
@@ -75,7 +75,7 @@ def draw(
     scanned = [number for number in numbers if number > 0]
     if not scanned:
         return np.array([first for _ in numbers])
-    coarse = make_features_objective(objective, track).quicker.rough
+    coarse = make_features_objective(objective, track).quicker
     # Close to the walls as well: of many parameters the likely values are a small share of the range.
     tried = np.concatenate([np.random.default_rng((seed, number)).uniform(EDGE, 1 - EDGE, (scan, space.size))
                             for number in scanned])

@@ -121,11 +121,11 @@ def _from_elsewhere(
     iterations, the best of them to its end where it is lower by then."""
     if not len(starts):
         return result
-    spent, rough = result.evaluations, getattr(objective, "rough", objective)
+    spent = result.evaluations
     if len(starts) > KEPT:
-        first = search(rough, starts, FIRST)
+        first = search(objective, starts, FIRST)
         starts, spent = first.starts[:KEPT], spent + first.evaluations
-    new = search(rough, starts, min(LOOK, iterations))
+    new = search(objective, starts, min(LOOK, iterations))
     spent += new.evaluations
     if new.cost < result.cost:
         new = search(objective, new.u[None], iterations)
