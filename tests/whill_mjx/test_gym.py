@@ -182,9 +182,11 @@ def test_a_video_is_recorded(tmp_path):
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("actions", [None, 0, np.zeros(3), "ab", ["1", "2"], {"a": 1}, object(), [10**400, 0],
-                                     [[0], [0, 0]], np.zeros(2, complex)], ids=["none", "zero", "three", "letters", "texts", "table",
-                         "object", "huge", "ragged", "complex"])  # fmt: skip
+@pytest.mark.parametrize(
+    "actions",
+    [None, 0, np.zeros(3), "ab", ["1", "2"], {"a": 1}, object(), [10**400, 0], [[0], [0, 0]], np.zeros(2, complex)],
+    ids=["none", "zero", "three", "letters", "texts", "table", "object", "huge", "ragged", "complex"],
+)
 def test_actions_that_are_no_numbers_are_refused_in_one_line(actions):
     with pytest.raises(ValueError, match="^the action .*must be numbers of shape") as refused:
         as_actions(actions, (2,))
