@@ -5,7 +5,7 @@
     python -m benchmarks.course run --preset wallclock [--learner ppo] --seed 0 --out runs/wallclock/0
     python -m benchmarks.course together --seeds 0 1 2 --out runs/course/fixed --layout fixed    # in one program
     python -m benchmarks.course collect --runs runs/course/*      # into benchmarks/results/course.json, with a plot
-    python -m benchmarks.course together --change mirror=false --out runs/ablation/unmirrored
+    python -m benchmarks.course together --change mirror=0 --out runs/ablation/unmirrored
     python -m benchmarks.course ablation --runs runs/ablation/*   # one figure for all seeds of a name NAME_SEED
     python -m benchmarks.course planner
 """

@@ -233,6 +233,9 @@ def main(arguments: list[str] | None = None) -> int:
         if options.joystick_lock and not options.require_arm:
             raise OptionError("--joystick-lock takes the joystick from the rider, so an operator must arm. Give "
                               "--require-arm too.")
+        if options.compressed and policy.pacer.kind != "camera":
+            raise OptionError(f"--compressed is of camera images, and {options.policy} is paced by a "
+                              f"{policy.pacer.kind}. Leave it out.")
         safety = safety_config(policy, options)
         view = view_of(policy.pacer, options.crop and tuple(options.crop), options.calibration)
     except ValueError as error:

@@ -43,7 +43,8 @@ class Parser(argparse.ArgumentParser):
         if again := [name for name in names if names.count(name) > 1 and name not in repeatable]:
             self.error(f"{again[0]}: is given twice. Leave one out")
         for before, word in zip(["", *words], words, strict=False):
-            if word.rpartition("=")[2].startswith("~/"):
+            name = word.partition("=")[0] if "=" in word else before
+            if word.rpartition("=")[2].startswith("~/") and not name.endswith(("-topic", "-state")):  # a private name
                 self.error(f"{word}: the shell has not put your home folder in place of ~. Write it out")
             if not word.strip() or word.startswith("--") and word.endswith("="):
                 self.error(f"{before or word or 'the first word'}: an empty word, as of an unset variable. "

@@ -367,6 +367,7 @@ def main(arguments: list[str] | None = None) -> int:
             writer = SplitWriter(options.dataset, options.trial, options.split, say_trial)
         else:
             writer = TrialWriter(options.dataset, options.trial)
+        options.dataset.mkdir(parents=True, exist_ok=True)
         write_dataset_file(options.dataset, options)
     except (ValueError, OSError) as error:
         print(f"bridge.record: {said(error)}", file=sys.stderr)

@@ -82,7 +82,7 @@ def reader_of(sensor: SensorInput, unwrap: Callable[[str, np.ndarray], np.ndarra
     if sensor.kind == "lidar":
         return lambda message: _scan(message, sensor)
     if sensor.kind == "odometry":
-        return lambda message: _counted(unwrap(sensor.name, _pose(message)))
+        return lambda message: _stamped(unwrap(sensor.name, _pose(message)), message)
     return {"imu": _imu, "goal": _goal}[sensor.kind]
 
 
@@ -91,14 +91,18 @@ def _counted(value: np.ndarray) -> Reading:
     return value, zlib.crc32(value.tobytes())
 
 
+def _stamped(value: np.ndarray, message: Any) -> Reading:
+    """A value with a hash of its stamp: it may stay the same until the vehicle moves, though its sensor works."""
+    return value, hash((message.header.stamp.sec, message.header.stamp.nanosec))
+
+
 def _scan(message: Any, sensor: SensorInput) -> Reading:
     ranges = np.asarray(message.ranges, np.float32)
     scan = Scan(message.angle_min, message.angle_increment, message.range_min, message.range_max, ranges)
     rays = rays_of(scan, sensor)
     empty = rays.min() >= float(sensor.settings.get("reach", REACH))
-    stamp = message.header.stamp
     # in a wide hall nothing changes, and yet the scanner works
-    return rays, hash((stamp.sec, stamp.nanosec)) if empty else zlib.crc32(ranges.tobytes())
+    return _stamped(rays, message) if empty else (rays, zlib.crc32(ranges.tobytes()))
 
 
 def _pose(message: Any) -> np.ndarray:
@@ -118,7 +122,7 @@ def _goal(message: Any) -> Reading:
     if frame.rpartition("/")[2] not in BODY_FRAMES:
         raise SenseError(f"the goal is given in the frame {frame[:40]!r}; it must be in {' or '.join(BODY_FRAMES)}, "
                          "ahead and to the left of the vehicle. Transform it before.")
-    return _counted(numbers(message.point.x, message.point.y))
+    return _stamped(numbers(message.point.x, message.point.y), message)
 
 
 def message_of(header: Any, sensor: SensorInput, value: np.ndarray, period: float) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 
 from bridge.frames import FrameWatch
 from bridge.policy import SensorInput
-from bridge.safety import Command, Supervisor
+from bridge.safety import Command, SafetyConfig, Supervisor
 
 AGE = 2.5
 """Periods after which a value is too old, as for the camera: 250 ms at 10 Hz."""
@@ -88,17 +88,16 @@ def numbers(*values: float) -> np.ndarray:
 class Stream:
     """The newest value of one sensor, and whether it is young enough."""
 
-    def __init__(self, sensor: SensorInput, period: float, stamp_age: float) -> None:
+    def __init__(self, sensor: SensorInput, limit: float, stamp_age: float) -> None:
         """Wait for a first value.
 
         Args:
             sensor: what gives the values.
-            period: of the policy [s].
+            limit: seconds after which a value is too old.
             stamp_age: stamps further than this [s] from their receipt are refused.
         """
         self.sensor = sensor
-        self.limit = AGE * max(period, sensor.age)
-        """Seconds after which a value is too old."""
+        self.limit = limit
         self.value: np.ndarray | None = None
         self.waits = True
         """Whether no value came since the last step."""
@@ -138,8 +137,9 @@ class Senses:
         """Prepare for the sensors of a policy with this period [s]; the supervisor is held while one is missing."""
         self.pacer, self._supervisor = pacer, supervisor
         stamp_age = supervisor.config.stamp_age
-        self.streams = {name: Stream(one, period, stamp_age) for name, one in sensors.items()
-                        if name != pacer.name and one.kind != "commands"}
+        slower = supervisor.config.frame_age / SafetyConfig.frame_age  # --frame-age, as of a simulator off real time
+        self.streams = {name: Stream(one, AGE * max(period, one.age) * slower, stamp_age)
+                        for name, one in sensors.items() if name != pacer.name and one.kind != "commands"}
         """By name; not the pacer and what the bridge itself knows."""
         self._sensors = sensors
         self._cameras = [stream for stream in self.streams.values() if stream.sensor.kind == pacer.kind == "camera"]
@@ -169,7 +169,7 @@ class Senses:
 
     def observation(self, paced: np.ndarray) -> np.ndarray | dict[str, np.ndarray]:
         """Return what the policy reads now, where its pacer shows `paced`; each stream must have a value."""
-        if not self.streams and not len(self._commands):
+        if not self.streams and not len(self._commands) and self.pacer.kind != "odometry":
             return paced
         seen: dict[str, np.ndarray] = {}
         for name, sensor in self._sensors.items():

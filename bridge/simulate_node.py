@@ -10,6 +10,7 @@ from typing import Any
 
 from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, number
+from bridge.policy import pacer_of
 from bridge.sense_topics import message_of, topics_of
 from bridge.simulated import Episode, Frame, SimulatedClock, SimulatedVehicle, enlarge, halfway
 from bridge.simulated_messages import (
@@ -56,7 +57,8 @@ class SimulateNode:
         self._e_stop = node.create_publisher(Bool, ros.E_STOP_TOPIC, ros.latched())
         self._transform = ros.transform_publisher(node)
         self._senses = self._sense_publishers()
-        self._pose_first = any(one.kind == "odometry" for one in (getattr(vehicle, "sensors", None) or {}).values())
+        sensors = getattr(vehicle, "sensors", None) or {}
+        self._pose_first = any(one.kind == "odometry" and one is not pacer_of(sensors) for one in sensors.values())
         self._clock = ros.clock_publisher(node) if options.clock else None
         kind = getattr(commands, options.command_type)
         node.create_subscription(kind, ros.COMMAND_TOPIC, self._on_command, ros.reliable())
@@ -212,9 +214,9 @@ class SimulateNode:
     def _show(self, frame: Frame) -> tuple[int, int]:
         """Publish the end of a period, and end the episode where it is over; return the stamp of the image."""
         self._frame = frame
-        self._publish_sensed(frame)  # the sensor that paces the policy comes last
         if self._pose_first:
             self._publish_pose(frame)
+        self._publish_sensed(frame)  # the sensor that paces the policy comes last
         stamp = self._publish_image(frame)
         if not self._pose_first:
             self._publish_pose(frame)

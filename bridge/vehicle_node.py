@@ -125,6 +125,7 @@ class VehicleNode:
         if stop:
             self.commands.publish_stops()
         if self._lock is not None:
+            self.supervisor.latch("the node ends")  # callbacks run while the driver's answer is waited for
             self._unlock(self._lock)
         self.guard.close()
 

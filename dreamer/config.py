@@ -192,6 +192,8 @@ class DreamerConfig:
     """Steps of the recurrences unrolled into one loop body: more is faster on a GPU, 1 is best on a CPU."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.mirror, bool):  # in older files
+            object.__setattr__(self, "mirror", int(self.mirror))
         for name, (low, high) in RANGES.items():
             value, whole = getattr(self, name), isinstance(getattr(type(self), name), int)
             ok = isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)

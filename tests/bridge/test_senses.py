@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ import tiny_policy
 
 from bridge.controller import Controller
 from bridge.policy import Policy, PolicyFileError, SensorInput
-from bridge.safety import SafetyConfig
-from bridge.senses import Scan, SenseError, rays_of
+from bridge.safety import SafetyConfig, Supervisor
+from bridge.sense_topics import reader_of
+from bridge.senses import Scan, SenseError, Senses, rays_of
 
 pytestmark = pytest.mark.quick
 LIDAR = SensorInput("lidar", "lidar", (4,), {"reach": 8.0})
@@ -77,6 +79,34 @@ def test_odometry_counts_from_the_place_and_heading_of_the_start():
     turned = senses.unwrapped("odometry", np.array([1.0 - 0.5, 2.0, -3.1, 0.2, 0.1]))
     ahead, left = 0.5 * np.cos(np.pi - 3.1), 0.5 * np.sin(np.pi - 3.1)
     assert senses._from_start("odometry", turned) == pytest.approx([ahead, left, 2 * np.pi - 6.2, 0.2, 0.1], abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["odometry", "goal"])
+def test_what_stays_the_same_until_the_vehicle_moves_is_new_by_its_stamp(kind):
+    read = reader_of(SensorInput(kind, kind, (5,)), lambda name, pose: pose)
+    messages = [SimpleNamespace(
+        header=SimpleNamespace(frame_id="base_link", stamp=SimpleNamespace(sec=1, nanosec=nanosec)),
+        pose=SimpleNamespace(pose=SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0),
+                                                  orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0))),
+        twist=SimpleNamespace(twist=SimpleNamespace(linear=SimpleNamespace(x=0.0), angular=SimpleNamespace(z=0.0))),
+        point=SimpleNamespace(x=3.0, y=0.0)) for nanosec in (1, 1, 2)]
+    (_, first), (_, again), (_, later) = map(read, messages)
+    assert first == again != later
+
+
+def test_odometry_alone_is_read_from_the_start_as_in_training():
+    policy = FakePolicy()
+    policy.sensors = {"odometry": SensorInput("odometry", "odometry", (5,))}
+    policy.pacer = policy.sensors["odometry"]
+    senses = Senses(policy.sensors, policy.pacer, 0.1, Drive(FakePolicy()).controller.supervisor)
+    seen = senses.observation(np.array([1.0, 2.0, 0.5, 0.0, 0.0]))
+    assert seen["odometry"].dtype == np.float32 and seen["odometry"].tolist() == [0.0] * 5
+
+
+def test_frame_age_slows_the_limits_of_all_sensors():
+    limits = [Senses(FakePolicy.sensors, FakePolicy.pacer, 0.1, Supervisor(SafetyConfig(
+        (0.0, -0.6), (0.3, 0.6), frame_age=age))).streams["rear"].limit for age in (0.25, 1.0)]
+    assert limits[1] == pytest.approx(4 * limits[0])
 
 
 class FakePolicy:

@@ -169,9 +169,9 @@ def sensors_of(contract: Any, task: Any) -> dict[str, Sensor]:
         settings: dict[str, Any] = dict(about.settings)
         if settings.get("rate_hz", 0) is None:  # JSON has no infinity
             settings["rate_hz"] = math.inf
-        if settings.get("mount"):
-            settings["mount"] = CameraMount(**settings["mount"])
         try:
+            if settings.get("mount"):
+                settings["mount"] = CameraMount(**settings["mount"])
             found[name] = own[name] if kind is None else kind(**settings)
         except TypeError as error:
             raise ValueError(f"observation {name!r} of the policy: settings {show(dict(about.settings))} do not suit a "
@@ -180,10 +180,14 @@ def sensors_of(contract: Any, task: Any) -> dict[str, Sensor]:
 
 
 def _plain(settings: Any) -> Any:
-    """Settings as JSON: an infinite rate is null."""
+    """Settings as JSON: a number that is not finite is null, and what JSON lacks is its text."""
     if isinstance(settings, dict):
-        return {key: _plain(value) for key, value in settings.items()}
-    return None if isinstance(settings, float) and math.isinf(settings) else settings
+        return {str(key): _plain(value) for key, value in settings.items()}
+    if isinstance(settings, list | tuple):
+        return [_plain(value) for value in settings]
+    if isinstance(settings, float):
+        return settings if math.isfinite(settings) else None
+    return settings if settings is None or isinstance(settings, bool | int | str) else str(settings)
 
 
 def _is_ground(model: VehicleModel, effect: Any) -> bool:

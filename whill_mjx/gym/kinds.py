@@ -254,6 +254,8 @@ def as_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
         found = np.asarray(actions)
     except ValueError:  # rows of several lengths
         found = np.empty((), object)
+    if found.dtype.name == "bfloat16":  # of JAX; NumPy has no kind for it
+        found = found.astype(np.float32)
     if found.dtype.kind not in "biuf" or found.shape != shape:
         there = f"has shape {found.shape}" if found.dtype.kind in "biuf" else f"is {shown(actions)}"
         raise ValueError(f"the action {there}; it must be numbers of shape {shape}: speed and yaw rate in [-1, 1].")

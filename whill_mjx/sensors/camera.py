@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from whill_mjx.env import observe
-from whill_mjx.io.fields import Field
+from whill_mjx.io.fields import CAMERA, Field, check_fields
 from whill_mjx.sensors.base import IMAGE, Reading, Sensor, View
 from whill_mjx.vehicle.specs import CameraMount
 
@@ -31,6 +31,11 @@ class Camera(Sensor):
     """Columns; None takes those of the environment."""
     mount: CameraMount | None = None
     """Where it sits; None: where the vehicle's camera does. A second camera has its own."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mount is not None:
+            check_fields("sensor Camera: mount", CAMERA, self.mount)
 
     def size(self, env: Any) -> tuple[int, int]:
         """Rows and columns."""
