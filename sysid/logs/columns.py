@@ -68,6 +68,8 @@ PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")
 """A unit of rows: so many in a second."""
 SIDES = {"left": {"left", "l", "lw", "wl", "vl", "lft", "fl", "rl", "bl", "lf", "lb", "links", "linkes"},
          "right": {"right", "r", "rw", "wr", "vr", "rgt", "fr", "rr", "br", "rf", "rb", "rechts", "rechtes"}}
+CORNERS = {"fl", "rl", "bl", "lf", "lb", "fr", "rr", "br", "rf", "rb"}
+"""Names of wheels that may mean other things where they stand alone."""
 TIME_WORDS = ("t", "time", "zeit", "timestamp", "stamp", "clock", "epoch", "unixtime", "rostime", "date", "datetime",
               "uhrzeit", "datum")
 NOT_PLANAR = {"roll", "pitch", "z", "tz", "vy", "vz", "wx", "wy", "covariance", "accel", "acceleration", "acc", "mag",
@@ -178,7 +180,8 @@ def guess(
         roles = {one.role for one in found if one.role != "time"}
         candidates = [column for name in table.columns if (table.stem, name) not in taken
                       and (column := _by_name(table, name)) is not None]
-        for column in sorted(candidates, key=lambda one: not one.sure):
+        long_unit = {"min", "h", "d"}  # a column of hours may stand beside the time itself
+        for column in sorted(candidates, key=lambda one: (not one.sure, one.role == "time" and one.unit in long_unit)):
             rival = column.role == "time" and any(one.role == "time" and one.file == table.stem for one in found)
             if not rival and column.role not in roles:
                 found.append(column)
@@ -248,7 +251,9 @@ def _by_name(table: Table, name: str) -> Column | None:
     if quantity in ("left", "right", "left_angle", "right_angle") and not unit and TICKS.search(name) \
             and stream == "wheels" and _counts(table.columns[name]):
         return Column(f"wheels.{quantity.removesuffix('_angle')}_angle", table.stem, name, "", "its name", False)
-    return Column(f"{stream}.{quantity}", table.stem, name, unit, "its name", sure)
+    of_a_body = any(_words(_split_unit(one)[0]) == ["rx"] for one in table.columns)
+    doubtful = words == ["rz"] and not of_a_body or len(words) == 1 and words[0] in CORNERS
+    return Column(f"{stream}.{quantity}", table.stem, name, unit, "its name", sure and not doubtful)
 
 
 def _counts(values: np.ndarray) -> bool:
@@ -276,7 +281,8 @@ def _quantity(words: list[str]) -> str | None:
     last = words[-1]
     if match := re.search(r"\b(x|y|z|theta|yaw|heading|psi) (vel|velocity|speed|rate|dot)$", text):
         return {"x": "v", "y": None, "z": None}.get(match[1], "omega")
-    if match := re.search(r"\b(?:vel|velocity|speed|rate|v) (x|y|theta|yaw|heading|psi)$", text):
+    if "angular" not in words and (
+            match := re.search(r"\b(?:vel|velocity|speed|rate|v) (x|y|theta|yaw|heading|psi)$", text)):
         return {"x": "v", "y": None}.get(match[1], "omega")
     if match := re.fullmatch(r"(?:\w+ )?(x|y|theta|yaw|heading) (?:pos|position)", text):
         return match[1] if match[1] in "xy" else "yaw"

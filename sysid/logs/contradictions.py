@@ -12,6 +12,7 @@ import numpy as np
 from sysid.logs.directions import (
     MOVING,
     NONE,
+    PLAINER,
     RESPONSE,
     SURE,
     UNLIKE,
@@ -147,6 +148,9 @@ def running_fast(name: str, trials: Sequence[Trial], beside: str = "commands") -
         return ""
     unlike = np.mean(curves, axis=0)
     k, now = int(np.argmin(unlike)), float(unlike[len(rates) // 2])
+    if beside == "commands" and now < PLAINER and not (
+            name == "odometry" and running_fast("ground_truth", trials, "odometry")):
+        return ""  # a lag behind ramps of the commands does as much; only an outside pose shows less
     if not 0 < k < len(rates) - 1 or 1 - unlike[k] < WHOLE or unlike[k] > LEFT[beside] * now:
         return ""
     bend = unlike[k - 1] - 2 * unlike[k] + unlike[k + 1]

@@ -13,6 +13,7 @@ JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step
 RARE = (3, 0.05)  # jumps of one drive, and of the rows of an outside pose; more are noise
 HELD = 0.5  # s for which rows repeat before a jump when a driver was held up
 FROZEN = 1.0  # s for which rows repeat that is longer than a driver takes between two updates
+STILL = 1e-3  # m/s and rad/s below which a speed is none
 MOVED = 0.5  # m and rad that a vehicle goes and turns by when each of its columns must change
 
 
@@ -80,9 +81,13 @@ def _frozen_of(name: str, trial: Trial) -> tuple[float, float, str, float] | Non
     stream = getattr(trial, name)
     other = "odometry" if name == "ground_truth" else "ground_truth"
     beside = getattr(trial, other)
-    if stream is None or beside is None or stream.x is None or stream.y is None or beside.x is None:
+    if stream is None or beside is None or beside.x is None:
         return None
-    same = (np.diff(stream.x) == 0) & (np.diff(stream.y) == 0)
+    if stream.x is None or stream.y is None or stream.yaw is None:
+        return None
+    same = (np.diff(stream.x) == 0) & (np.diff(stream.y) == 0) & (np.diff(stream.yaw) == 0)
+    if name == "odometry":  # at rest it repeats as well
+        same &= (np.abs(stream.v[:-1]) > STILL) | (np.abs(stream.omega[:-1]) > STILL)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     runs = [(float(stream.t[a]), float(stream.t[b])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     begin, end = max(runs, key=lambda one: one[1] - one[0], default=(0.0, 0.0))

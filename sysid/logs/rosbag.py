@@ -305,7 +305,8 @@ def choose_topics(
             continue
         usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
         fitting = [name for name, kind in known.items() if short_type(kind) in TYPES[stream]
-                   and name not in (*chosen.values(), *asked.values())]
+                   and name not in (*chosen.values(), *asked.values())
+                   and (stream == "ground_truth" or name not in TOPICS["ground_truth"])]
         fitting = [name for name in fitting if short_type(known[name]) != "JointState"] or fitting
         if usual:
             chosen[stream] = usual[0]

@@ -264,7 +264,8 @@ def _stacked_names(rows: Sequence[Sequence[str]]) -> tuple[list[str], int] | Non
                   > max(len([one for one in row if one]), 1)), 0)
     units = first > 1 and all(unit_named(one) for one in rows[first - 1] if one) and any(rows[first - 1])
     last = first - 1 - units
-    if last < 1 or len({len(row) for row in rows[: first + 1]}) > 1:
+    whole = all(rows[0]) and len(set(rows[0])) == len(rows[0])  # names enough: what follows are cells without a value
+    if last < 1 or whole or len({len(row) for row in rows[: first + 1]}) > 1:
         return None
     names, above = list(rows[last]), rows[last - 1]
     if len(set(names)) < len(names):

@@ -39,7 +39,8 @@ def account(findings: Findings, priors: Thresholds) -> dict[str, Any]:
         one = findings.sets[i]
         joined = (" and " if len(one.effects) < 3 else ", ").join(spoken(name) for name in one.effects)
         rows.append({"name": joined, "share": findings.named(one, priors),
-                     "weight": judged.weights.get(" + ".join(one.effects), 0.0),
+                     "weight": next((weight for key, weight in judged.weights.items()
+                                     if {*key.split(" + ")} == {*one.effects}), 0.0),
                      "outcome": _outcome(findings, priors, judged, i)})
     for key, name in (("none", "nothing"), ("noise", "nothing but other noise"), ("unknown", "something unknown")):
         if key in judged.weights:
@@ -64,7 +65,7 @@ def _outcome(findings: Findings, priors: Thresholds, judged: Posterior, number: 
         return "no more than days differ by"
     if number != judged.chosen:
         return "explains less" if len(one.effects) == 1 else "weighs less"
-    return "named" if judged.verdict == "named" else "explains too little"
+    return "named" if judged.verdict == "named" else "weighs less than something unknown"
 
 
 def draw(account: Mapping[str, Any]) -> str:

@@ -166,7 +166,7 @@ def _limits(robot: Robot, v: float) -> list[str]:
     across = np.cross([0.0, 0.0, 1.0], _forward(robot, data, int(host.body_rootid[host.jnt_bodyid[joints[0]]])))
     found += [f"the axis of joint {host.joint(one).name} does not lie across the vehicle (URDF's default is 1 0 0)"
               for one in joints if abs(float(data.xaxis[one] @ across)) < ACROSS]
-    radii = [radius_of(robot.path, host, int(host.jnt_bodyid[one])) for one in joints]
+    radii = [radius_of(robot.path, host, int(host.jnt_bodyid[one]), robot.wheel_radius) for one in joints]
     if max(radii) > (1 + ALIKE) * min(radii):
         found.append("the radii of its wheels differ: " + ", ".join(
             f"{host.joint(one).name} {radius:.4g} m" for one, radius in zip(joints, radii, strict=True)))

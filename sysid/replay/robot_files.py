@@ -44,7 +44,7 @@ def read_robot(
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
     """
     text = decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF, URDF or xacro file."))
-    xacro = path.suffix == ".xacro" or "<xacro:" in text
+    xacro = path.suffix == ".xacro" or "<xacro:" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     text, left_out = expand_xacro(path) if xacro else (text, [])
     try:
         top = ElementTree.fromstring(text)

@@ -179,7 +179,7 @@ class Findings:
     def unit(self) -> float:
         """Squared residual that is worth 1 of log weight: those of days with nothing missing vary by `day`, as those of
         2 / day^2 independent values do."""
-        return max(self.day**2 * self.count, 2.0)
+        return max(self.day * self.day * self.count, 2.0)
 
     def least_gain(self, priors: Thresholds) -> float:
         """By how much an effect must lower the cost for nothing to have less than alpha of the weight."""
@@ -242,7 +242,8 @@ def _log_weights(findings: Findings, priors: Thresholds, best: TriedSet | None) 
         return {"unknown": 0.0}
     for one in findings.sets:
         if findings.able(one, priors):
-            name, weight = " + ".join(one.effects), findings.log_weight(one.gain, len(one.effects), priors)
+            name = next((key for key in out if {*key.split(" + ")} == {*one.effects}), " + ".join(one.effects))
+            weight = findings.log_weight(one.gain, len(one.effects), priors)
             out[name] = max(weight, out.get(name, -math.inf))
     left = findings.predictable(best.left, priors.form**2, priors.alpha)
     return {**out, "unknown": findings.log_weight(priors.share * (best.gain + max(0.0, *left.values())), 1, priors)}

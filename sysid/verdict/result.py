@@ -63,7 +63,7 @@ class LoopConfig:
     seed: Annotated[int, SEED] = 0
     """Of the simulated nulls."""
     refit_nulls: Annotated[int, Range(0, 1_000_000)] = 0
-    """Simulated days with nothing missing that are refitted as the drives are; from 100 they decide too."""
+    """Simulated days with nothing missing that are refitted as the drives are; from 200 they decide too."""
     quick: bool = False
     """Fewer iterations, nulls and candidates."""
     physics_dt: Annotated[float, PHYSICS_DT] = 0.005

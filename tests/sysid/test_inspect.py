@@ -52,6 +52,15 @@ def delayed(signal, delay, lag):
     return out[::20]
 
 
+def delayed_slowly(signal, lag, dt=0.01):
+    """The signal after a lag [s]."""
+    out, y = np.empty_like(signal), signal[0]
+    for i, u in enumerate(signal):
+        y += (u - y) * (1 - np.exp(-dt / lag))
+        out[i] = y
+    return out
+
+
 def trial_of(command, name="drive_1", offset=0.0, held_out=False, yaw=0.0):
     """A trial that follows its commands exactly, with the outside pose's clock `offset` seconds late."""
     t = np.arange(0.0, command.t[-1], 0.05)
@@ -372,6 +381,24 @@ def test_a_clock_that_runs_fast_or_slow_is_named_with_its_stream_and_rate(stream
     (found,) = sanity(log_of(replace(good, **{stream: replace(source, t=source.t * (1 + rate))})))
     assert found.startswith(f"{stream}: its clock runs") and ("faster" if rate > 0 else "slower") in found
     assert float(re.search(r"runs about (\d)%", found)[1]) == pytest.approx(100 * abs(rate), abs=1)
+
+
+@pytest.mark.parametrize("lag", [0.6, 1.2])
+def test_a_slow_answer_to_ramps_is_no_clock_that_runs_slow(lag):
+    t = np.arange(0.0, 8.0, 0.01)
+    ramp = np.clip(np.floor(t) / 8, 0.0, 0.8)
+    good = trial_of(Command(t, ramp, 0 * t))
+    late = np.interp(good.odometry.t, t, delayed_slowly(ramp, lag))
+    moved = replace(good, odometry=replace(good.odometry, v=late, x=None, y=None, yaw=None), ground_truth=None)
+    assert not any("clock" in one for one in sanity(log_of(moved)))
+
+
+def test_a_turn_on_the_spot_with_a_marker_ahead_is_no_frozen_odometry():
+    t = np.arange(0.0, 12.0, 0.01)
+    good = trial_of(Command(t, 0 * t, 0.6 * np.sin(t)))
+    pose = good.ground_truth
+    ahead = replace(pose, x=pose.x + 0.4 * np.cos(pose.yaw), y=pose.y + 0.4 * np.sin(pose.yaw))
+    assert not any("rows repeat" in one for one in sanity(log_of(replace(good, ground_truth=ahead))))
 
 
 def test_a_base_that_drives_on_while_commands_pause_is_fine():

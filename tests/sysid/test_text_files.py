@@ -153,11 +153,16 @@ def test_ticks_of_wheels_need_their_number_in_a_turn(tmp_path):
     assert log.trials[0].odometry.v.max() == pytest.approx((c["v"] - c["w"] * 0.248).max(), rel=0.1)
 
 
-@pytest.mark.parametrize("names", [with_units, without_units, plotted, level])
+def beside_others(c):
+    """What could be taken for the time or for a speed, left of what is."""
+    return {"hour": 10.0 + 0 * c["t"], "angular_velocity.x": 0.1 * np.cos(c["t"]), **without_units(c)}
+
+
+@pytest.mark.parametrize("names", [with_units, without_units, plotted, level, beside_others])
 def test_columns_are_found_by_their_names_and_units_by_names_or_numbers(tmp_path, names):
     log, _ = convert(ConvertConfig(write(tmp_path / "drive.csv", names(columns())), tmp_path / "log"))
     (trial,) = log.trials
-    assert trial.name == "drive" and (trial.ground_truth is not None) == (names is without_units)
+    assert trial.name == "drive" and (trial.ground_truth is not None) == (names in (without_units, beside_others))
     check(trial)
 
 
@@ -198,6 +203,19 @@ def test_decimal_commas_and_cells_that_are_empty_are_read(tmp_path):
     path.write_text("\n".join(lines))
     log, notes = convert(ConvertConfig(path, tmp_path / "log"))
     assert len(log.trials[0].odometry.t) == len(c["t"]) - 1 and any("dead reckoned" in note for note in notes)
+
+
+@pytest.mark.parametrize("word", ["None", "null", "N/A", "-"])
+def test_words_in_the_first_rows_are_no_second_line_of_names(tmp_path, word):
+    c = columns()
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"], "odom_v": c["v"],
+                                          "odom_w": c["w"]})
+    lines = path.read_text().splitlines()
+    for row in (1, 2):
+        lines[row] = ",".join([*lines[row].split(",")[:3], word, word])
+    path.write_text("\n".join(lines))
+    log, _ = convert(ConvertConfig(path, tmp_path / "log"))
+    assert len(log.trials[0].odometry.t) == len(c["t"]) - 2
 
 
 def test_separators_of_thousands_are_no_decimals(tmp_path):
