@@ -178,6 +178,15 @@ def test_a_further_effect_must_do_more_than_to_mend_the_form_of_the_others():
 
 
 @pytest.mark.quick
+def test_a_set_that_was_refitted_in_both_orders_keeps_its_weight_together():
+    pairs = [("quadratic_drag", "slope"), ("slope", "quadratic_drag")]
+    given = findings(28.0, [tried(0.0, effects=effects, gain=280.0, own=(200.0, 90.0)) for effects in pairs])
+    (weight,) = [weight for name, weight in posterior(given, Thresholds()).weights.items() if "slope" in name]
+    assert weight > 0.9
+    assert [one["weight"] for one in account(given, Thresholds())["explanations"] if "slope" in one["name"]] == [weight]
+
+
+@pytest.mark.quick
 def test_a_further_effect_must_gain_more_than_days_differ_by():
     for gain, chosen in ((28.0, 0), (38.0, 1)):
         given = findings(28.0, [tried(5.0, gain=23.0), tried(0.0, effects=("quadratic_drag", "slope"), gain=gain)])
