@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -205,11 +206,11 @@ def recorded(dataset: Path, plan: Plan) -> int:
 def _port(here: Station, process: subprocess.Popen[bytes]) -> int:
     """The port that a plant prints at its start."""
     end, log = time.monotonic() + PATIENCE, here.log("plant")
-    while "port " not in (text := log.read_text()):
+    while not (found := re.search(r"\bport (\d+)\b", log.read_text())):
         if process.poll() is not None or time.monotonic() > end:
             raise StageError(f"the plant did not start: {last_line(log)}; see {log}")
         time.sleep(0.05)
-    return int(text.split("port ")[1].split()[0])
+    return int(found[1])
 
 
 def last_line(log: Path) -> str:

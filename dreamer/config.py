@@ -212,6 +212,7 @@ class DreamerConfig:
             (self.replay_memory in ("auto", "device", "host"), "replay_memory", "must be 'auto', 'device' or 'host'"),
             (self.noise_steps == 0 or self.noise_steps >= 1, "noise_steps", "must be 0 or at least 1"),
             (self.lr_decay == 0 or self.lr_decay > self.warmup, "lr_decay", f"must exceed warmup ({self.warmup})"),
+            (self.average_rate < 1, "average_rate", "must be below 1: an average remembers"),
             (self.greedy_share < 1, "greedy_share", "must be below 1: somebody explores"),
             (self.min_std <= self.max_std, "min_std", f"must be at most max_std ({self.max_std:g})"),
             (self.imag_last == 0 or self.imag_last >= 2, "imag_last", "must be 0 (all) or at least 2"),

@@ -230,8 +230,7 @@ def record_motion(
             state = substep(model, params, state, command)
             return state, observe(state)
 
-        x, y, yaw, v, omega = start
-        first = place(model, params, x, y, yaw, (v, omega))
+        first = place(model, params, *start)
         last, rest = jax.lax.scan(physics, first, command)
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), observe(first), rest), last.diverged
 
@@ -251,8 +250,6 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
     check_once("--effects", [text.partition(":")[0] for text in options.effects])
     if options.replicates < 1:
         raise ValueError(f"--replicates {options.replicates}: must be at least 1. Leave it out for a single drive.")
-    if set(names) == set(options.held_out):
-        raise ValueError(f"--held-out {' '.join(options.held_out)}: leaves no manoeuvre to fit. Leave one out.")
     absent = sorted(set(options.held_out) - set(names))
     if absent:
         raise ValueError(f"--held-out {absent[0]}: not among the manoeuvres driven ({', '.join(names)}). Add it there.")

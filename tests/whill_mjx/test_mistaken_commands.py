@@ -108,7 +108,6 @@ def mistaken(command, words, capsys):
     ("look", "--scene corridor --scene docking", "--scene: is given twice"),
     ("look", "--out data/trials/drive/a.png", "lies among the trials of"),
     ("drive", "--out data/trials/drive", "lies among the trials of"),
-    ("drive", "--out new --held-out figure_eight", "leaves no manoeuvre to fit"),
     ("drive", "--out new --noise-levels.position 1", "--noise-levels: has an effect only with --noise"),
     ("drive", "--out new --effects yaw_scrub:", "no parameter follows the colon"),
     ("drive", "--out new --effects yaw_scrub:torque=1e300", "torque is 1e+300 N m"),

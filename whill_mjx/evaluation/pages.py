@@ -85,7 +85,7 @@ def _legend(figure: Any, endings: set[str], columns: int) -> None:
         Line2D([], [], color="tab:blue", marker="s", linestyle=":", markersize=4, label="goal and its region"),
         Patch(color="grey", label="boxes and walls, in their colours"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=8 if columns > 1 else 7)
 
 
 def sweep_picture(sweep: Sweep, out: Path, name: str) -> Path:
