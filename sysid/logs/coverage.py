@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.logs.contradictions import another_clock, contradictions
+from sysid.logs.directions import UNLIKE
 from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
@@ -231,11 +232,15 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
 
 
 def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
-    """A sentence where the measured speed follows the commanded yaw rate and the other way round; else empty."""
+    """A sentence where the measured speed follows the commanded yaw rate and the other way round, and not its own
+    command, which in a circle is much like the other; else empty."""
     other = [replace(one, command=Command(one.command.t, one.command.omega, one.command.v)) for one in trials]
     for index in (1, 2):
-        follows = [gain[1] for one in other if (gain := _gain(one, channel, index)) is not None]
+        as_it_is, follows = ([gain[1] for one in these if (gain := _gain(one, channel, index)) is not None]
+                             for these in (trials, other))
         if not follows or np.median(follows) < ALIKE:
+            return ""
+        if as_it_is and 1 - np.median(follows) > UNLIKE * (1 - np.median(as_it_is)):
             return ""
     return (f"command: the speed that {channel} shows follows omega, and its yaw rate follows v: the two columns are "
             "exchanged.")

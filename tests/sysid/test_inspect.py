@@ -174,6 +174,10 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     assert not any("sign is reversed" in one for one in sanity(log_of(folded)))
     swapped = replace(good, command=Command(good.command.t, good.command.omega, good.command.v))
     assert any("the two columns are exchanged" in one for one in sanity(log_of(swapped)))
+    t = np.arange(0.0, 20.0, 0.01)
+    circle = trial_of(Command(t, 0.5 * np.sin(0.5 * t), 0.4 * np.sin(0.5 * t)))  # either follows either
+    small = replace(circle.odometry, v=0.4 * circle.odometry.v, x=None, y=None, yaw=None)
+    assert not any("exchanged" in one for one in sanity(log_of(replace(circle, odometry=small, ground_truth=None))))
     millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
                                                      y=1e3 * good.ground_truth.y))
     assert any("must be in metres" in one for one in sanity(log_of(millimetres)))
