@@ -358,18 +358,22 @@ def steady_timer(node: Any, period: float, callback: Callable[[], object]) -> An
     return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
+def _of_the_maker(module: str, name: str, what: str) -> Any:
+    """Return a type of the maker's message package; SystemExit says how to get it."""
+    try:
+        return getattr(importlib.import_module(f"whill_msgs.{module}"), name)
+    except ImportError as error:
+        raise SystemExit(f"{error}. {what} is a whill_msgs/{name}. Build the maker's ros2_whill_interfaces in your "
+                         "workspace and source it.") from error
+
+
 def chair_state_type() -> Any:
     """Return the message class of the WHILL driver's state.
 
     Raises:
         SystemExit: the maker's message package is not installed.
     """
-    try:
-        from whill_msgs.msg import ModelCr2State
-    except ImportError as error:
-        raise SystemExit(f"{error}. The chair's state is a whill_msgs/ModelCr2State. Build the maker's "
-                         "ros2_whill_interfaces in your workspace and source it.") from error
-    return ModelCr2State
+    return _of_the_maker("msg", "ModelCr2State", "The chair's state")
 
 
 def joystick_locker(node: Any) -> Callable[[bool, Callable[[bool], None]], None]:
@@ -380,11 +384,7 @@ def joystick_locker(node: Any) -> Callable[[bool, Callable[[bool], None]], None]
     Raises:
         SystemExit: the maker's message package is not installed.
     """
-    try:
-        from whill_msgs.srv import SetJoystickLock
-    except ImportError as error:
-        raise SystemExit(f"{error}. The joystick's lock is a whill_msgs/SetJoystickLock. Build the maker's "
-                         "ros2_whill_interfaces in your workspace and source it.") from error
+    SetJoystickLock = _of_the_maker("srv", "SetJoystickLock", "The joystick's lock")  # noqa: N806
     client = node.create_client(SetJoystickLock, JOYSTICK_LOCK_SERVICE)
 
     def ask(locked: bool, answered: Callable[[bool], None]) -> None:
