@@ -39,7 +39,7 @@ REACH, LAG_DT = 10.0, 0.1  # s of delays that are tried beside a clock that runs
 LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
 LEFT = {"odometry": 0.5, "commands": UNLIKE}
 """Of what is not alike, what a clock that runs fast may leave, beside what is measured and beside commands."""
-DRIFT = 0.3  # s by which clocks must come apart in a drive to be told from a delay
+DRIFT = 0.3  # s by which clocks must come apart in a drive to differ from a delay
 MOST, FAST, RATE_STEP = 0.15, 0.2, 0.005  # by which a clock may run fast or slow, how far is searched, and its steps
 
 
