@@ -139,25 +139,25 @@ def shares(metrics: dict[str, Any]) -> dict[str, float]:
             for name, value in metrics.items()}  # fmt: skip
 
 
-def judged_driver(preset: Preset, course: Course) -> Driver:
-    """The policy with the number of a sight beside its weights, so that one program judges all sights."""
-    control_dt = course.env.model.config.control_dt
-    step, carry = ppo_policy(preset, control_dt, course.env)
-    nothing = {name: sensor.reading(course.env) for name, sensor in course.env.sensors}
+def judged_driver(preset: Preset, course: Course, params: Any) -> tuple[Driver, Any]:
+    """The policy, and its first memory, whose number of a sight says what it is shown: one program judges them all."""
+    step, carry = ppo_policy(preset, course.env.model.config.control_dt, course.env)
+    readings = {name: sensor.reading(course.env) for name, sensor in course.env.sensors}
+    empty = {name: jnp.zeros(one.shape, one.dtype) for name, one in readings.items()}
+    unseen = {name: jnp.full_like(empty[name], 0 if name == "camera" else readings[name].high)
+              for name in ("camera", "lidar") if name in empty}  # fmt: skip
 
     def act(weights: Any, memory: Any, state: Any, seen: dict[str, jax.Array], key: jax.Array) -> tuple[Any, jax.Array]:
-        params, sight = weights
-        carry, first, begun = memory
+        carry, first, begun, sight = memory
         first = jax.tree.map(lambda kept, now: jnp.where(begun, kept, now), first, seen)
-        blank = jax.tree.map(jnp.zeros_like, seen)
-        lost = {**seen, **{name: jnp.full_like(seen[name], 0 if name == "camera" else nothing[name].high)
-                           for name in ("camera", "lidar") if name in seen}}  # fmt: skip
-        shown = jax.tree.map(lambda *kinds: jnp.stack(kinds)[sight], seen, blank, first, lost)
-        carry, action = step(params, carry, shown)
-        return (carry, first, jnp.array(True)), action
+        kinds = (seen, empty, first, {**seen, **unseen})
+        shown = jax.tree.map(lambda *values: jnp.stack(values)[sight], *kinds)
+        carry, action = step(weights, carry, shown)
+        return (carry, first, jnp.array(True), sight), action
 
-    empty = {name: jnp.zeros(one.shape, one.dtype) for name, one in nothing.items()}
-    return Driver("policy", lambda state, key: (carry, empty, jnp.array(False)), act, preset.task.action_repeat)
+    memory = (carry, empty, jnp.array(False), jnp.int32(0))
+    weights = jax.tree.map(jnp.asarray, params)
+    return Driver("policy", lambda state, key: memory, act, preset.task.action_repeat, weights=weights), memory
 
 
 def judge(options: Options, preset: Preset, params: Any) -> dict[str, Any]:
@@ -165,11 +165,12 @@ def judge(options: Options, preset: Preset, params: Any) -> dict[str, Any]:
     task = dataclasses.replace(preset.task, map=maps_of(options, options.unseen))
     batch = make_evaluation_env(task, VEHICLE, 1)
     course = Course(batch.env, batch.params, batch=options.episodes)
-    driver, keys = judged_driver(preset, course), episode_keys(options.seed, options.episodes)
+    keys = episode_keys(options.seed, options.episodes)
+    driver, memory = judged_driver(preset, course, params)
+    memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(keys), *jnp.shape(leaf))), memory)
     found: dict[str, Any] = {}
     for number, sight in enumerate(SIGHTS):
-        weights = (jax.tree.map(jnp.asarray, params), jnp.int32(number))
-        episodes = course.drive(dataclasses.replace(driver, weights=weights), keys)
+        episodes = course.drive(driver, keys, memory=(*memory[:3], jnp.full(len(keys), number)))
         people = episodes.scene.people
         assert people is not None
         bumped = np.asarray(people.held & people.there).sum(-1)
@@ -200,7 +201,7 @@ def one_run(options: Options, senses: str, seed: int) -> dict[str, Any]:
     if path.exists():
         return json.loads(path.read_text())
     folder.mkdir(parents=True, exist_ok=True)
-    asked, preset = preset_of(options, senses, seed, folder)
+    _, preset = preset_of(options, senses, seed, folder)
     save_vehicle(folder / "vehicle.toml", *load_vehicle(VEHICLE)[:2])
     took_path = folder / "training.json"
     if not took_path.exists():
@@ -213,9 +214,19 @@ def one_run(options: Options, senses: str, seed: int) -> dict[str, Any]:
     result = {"senses": senses, "seed": seed, **took, **provenance(), "episodes": options.episodes,
               "sights": judge(options, preset, params), "judging_s": time.monotonic() - began}  # fmt: skip
     write_json(path, result)
+    return result
+
+
+def write_policy(options: Options, senses: str, seed: int) -> None:
+    """Write the policy file of a run, unless it is there."""
+    folder = options.out / f"{senses}_{seed}"
+    if (folder / "policy").exists():
+        return
+    asked, preset = preset_of(options, senses, seed, folder)
+    params = weights_of(preset, make_evaluation_env(preset.task, VEHICLE, 1).env, folder / "weights.msgpack")
+    took = json.loads((folder / "training.json").read_text())
     trained = Trained(params, took["decisions"], took["updates"], took["training_s"])
     export(asked, preset, folder / "vehicle.toml", trained, folder / "policy")
-    return result
 
 
 def weights_of(preset: Preset, env: Any, path: Path) -> Any:
@@ -253,7 +264,7 @@ def figures_of(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main(options: Options) -> None:
-    """Make all runs, and record the figures after each."""
+    """Make all runs, record the figures after each, and write the policy files."""
     runs = []
     for text in options.runs:
         senses, _, seed = text.partition(":")
@@ -269,6 +280,8 @@ def main(options: Options) -> None:
         for name in ("arrived", "collided", "bumped", "timeout", "blinded", "goal_alone"):
             one = figures[f"among_{senses}_{name}"]
             print(f"among_{senses}_{name}: {one['value']:.4f} {one['repeats']} -> {path}", flush=True)
+    for senses, seed in runs:
+        write_policy(options, senses, seed)
 
 
 if __name__ == "__main__":
