@@ -169,8 +169,8 @@ def parity(model: bytes, network: Network, steps: int) -> dict[str, Any]:
             apart.append(_distance([action], [one_action]))
     worst, usual = (float(of(apart)) if apart else 0.0 for of in (np.max, np.median))
     if not (usual <= ACTION_TOLERANCE and worst <= RESOLVED) or flips > FLIP_SHARE * steps:  # a NaN fails too
-        raise ValueError(f"policy.onnx: in {steps} steps it differs from JAX by {usual:.2g} in the median and {worst:.2g} "
-                         f"at most, with {flips} latent flips; rounding is {ACTION_TOLERANCE}, {RESOLVED} and "
+        raise ValueError(f"policy.onnx: in {steps} steps it differs from JAX by {usual:.2g} in the median and "
+                         f"{worst:.2g} at most, with {flips} latent flips; rounding is {ACTION_TOLERANCE}, {RESOLVED}, "
                          f"{FLIP_SHARE:.0%} flips. Export a deterministic step that computes in float32.")
     return {"steps": steps, "max_abs_action_difference": worst, "max_abs_action_drift": drift, "latent_flips": flips}
 

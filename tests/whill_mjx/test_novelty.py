@@ -84,7 +84,7 @@ def test_the_exported_network_of_a_watched_policy_is_one_that_evaluations_compil
     assert parity(data, exported, 5)["max_abs_action_difference"] < 1e-5
     image = np.full((8, 8, 3), 51, np.uint8)
     given = [image, *(np.ones(shape.shape, np.float32) for shape in shapes.values())]
-    for ours, theirs in zip(jax.jit(Network(data))(*given), jax.tree.leaves(_in_order(act, given, shapes)), strict=True):
+    for ours, theirs in zip(jax.jit(Network(data))(*given), _in_order(act, given, shapes), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
