@@ -1,10 +1,9 @@
-"""What is minimised: the motion of drives in short bins, whitened by the noise that replicates or the fit itself leave.
+"""What is minimised: the motion of drives in short bins, whitened by the noise that replicates or the fit itself
+leave.
 
-Disturbances push a vehicle off its course, and a pose adds up all of them: errors of whole poses are correlated over a
-drive, and least squares of them let a few late ones outvote every other moment. Motion within a bin of a quarter
-of a second, seen from the vehicle itself, has errors that hardly reach beyond it; a vector autoregression makes them
-white (`sysid.errors.noise`), and where wheels are pulled hard, bins count by the noise that they have there. Least
-squares of those are generalised least squares: intervals are what curvature says. Source: Aitken (1936).
+A pose adds up all disturbances before it, so errors of whole poses are correlated over a drive. Errors of the motion
+within a quarter of a second hardly reach beyond it; a vector autoregression makes them white (`sysid.errors.noise`).
+Where wheels are pulled hard, bins count by the noise that they have there. Generalised least squares: Aitken (1936).
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ from sysid.search import least_squares
 from whill_mjx.io.steps import steps_of_rows
 
 LONG = 8
-"""Bins of memory of the filter, where a log allows so much: the noise of a pose itself cancels from bin to bin, which a
-short memory takes for a vehicle that drifts."""
+"""Bins of memory of the filter: the noise of a pose cancels from bin to bin, which a short memory takes for a drift."""
 SETS = 64  # that a core replays between two saves: seconds for minutes of driving
 ROWS = 10  # times as many bins as the filter has coefficients in each row
 
@@ -169,11 +167,7 @@ def _bad(at: np.ndarray) -> np.ndarray:
 
 
 def make_features_objective(objective: Objective, track: float) -> FeatureObjective:
-    """Errors in features of what an objective of poses compares, in the noise that replicates show.
-
-    Args:
-        track: of the vehicle [m].
-    """
+    """Errors in features of what an objective of poses compares, in the noise that replicates show; `track` in m."""
     features = make_features(objective.trials, bin_width(objective.trials))
     target = features.of(objective.measured)
     groups = replicate_groups(objective.trials)

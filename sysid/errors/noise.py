@@ -1,7 +1,7 @@
-"""What differs between two equal drives, and the filter that turns it into white noise.
+"""What differs between two equal drives, and the filter (a vector autoregression) that turns it into white noise.
 
-Residuals of drives are autocorrelated and their channels go together; tests that take them as independent find effects
-in nothing. A vector autoregression fitted to what replicates do not share whitens both.
+Residuals of drives are autocorrelated and their channels correlated; tests that assume independence find effects in
+nothing.
 """
 
 from __future__ import annotations
@@ -34,9 +34,8 @@ class Whitener:
     def apply(self, series: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """White series (B, K, C, ...) of such series.
 
-        Args:
-            mask: (B, K, C) weights of the bins: 1 where the noise has its usual size, less where it is larger, 0 where
-                nothing was measured, which counts as no deviation.
+        `mask`: (B, K, C) weights of the bins, less than 1 where the noise is larger than usual, 0 where nothing was
+        measured.
         """
         extra = (1,) * (series.ndim - 3)
         shown = mask.reshape(*mask.shape, *extra)
@@ -81,8 +80,7 @@ ROUGH = (0.1, 0.5, 1.5)
 def roughness(simulated: np.ndarray, width: float, track: float) -> np.ndarray:
     """(B, K) class of each bin, 0 to 3, by the largest acceleration of a wheel around it in simulated features.
 
-    Where wheels are pulled hard they slip, and there a model is least exact: its leftovers are counted as noise of
-    their own size, so that they neither hide what steady driving shows nor pass for an effect.
+    Where wheels are pulled hard they slip and a model is least exact: its leftovers count as noise of their own size.
     """
     speeds = simulated[..., :2] * np.array([1.0, track / 2])
     change = np.abs(np.diff(speeds, axis=1, prepend=speeds[:, :1])).sum(-1) / width
@@ -106,8 +104,7 @@ def fit_roughness(series: np.ndarray, mask: np.ndarray, level: np.ndarray) -> np
 
 
 def replicate_groups(trials: tuple[Trial, ...]) -> list[list[int]]:
-    """Indices of trials that were given the same commands at the same time, so that their bins correspond, in order of
-    first appearance."""
+    """Indices of trials with the same commands at the same time, so that their bins correspond, by first appearance."""
     return same_course(trials, BIN_SHIFT)
 
 
@@ -117,8 +114,7 @@ def repeated(trials: Sequence[Trial]) -> bool:
 
 
 def deviations(series: np.ndarray, groups: list[list[int]]) -> np.ndarray:
-    """Series (B, K, C) less the mean of their replicates, scaled to the size of a single drive's noise; 0 where a
-    drive has no replicate."""
+    """Series (B, K, C) less the mean of their replicates, scaled to a single drive's noise; 0 without a replicate."""
     out = np.zeros_like(series)
     for group in groups:
         if len(group) > 1:

@@ -1,9 +1,7 @@
-"""How noisy each channel is beside the reference days.
+"""How noisy each channel is beside the reference days: the median of second differences in time.
 
-The size of the noise is the median of second differences in time: a missing effect is smooth and hardly shows in
-them, and what strikes now and then (lost commands, a soft patch) does not move a median. Where there are replicates,
-the differences are those of their deviations from one another, which need no model. Otherwise they are those of what
-the model leaves while commands have been constant for a while.
+A missing effect is smooth and hardly shows in them, and lost commands or a soft patch do not move a median. With
+replicates, differences are of their deviations from one another, else of what the model leaves at constant commands.
 """
 
 from __future__ import annotations
@@ -75,8 +73,7 @@ class NoiseLevels:
 def noise_levels(ours: NoisyDrives, theirs: NoisyDrives, channels: Sequence[str], alpha: float) -> NoiseLevels | None:
     """Noise of some drives beside that of the reference's; None where too little was measured.
 
-    Args:
-        alpha: probability that a channel of any counts as changed where the noise is as usual.
+    `alpha`: probability that any channel counts as changed where the noise is as usual.
     """
     for parts in (_between_replicates, _in_steady_motion):
         mine, usual = _size(parts(ours)), _size(parts(theirs))
@@ -103,12 +100,8 @@ def steady_bins(trial: Trial, bins: int, width: float) -> np.ndarray:
 
 
 def said(levels: Mapping[str, Mapping[str, Any]], alone: bool) -> str:
-    """The channels that changed in a sentence without its full stop, "" where none did.
-
-    Args:
-        levels: as in a report.
-        alone: whether nothing else has changed.
-    """
+    """The channels that changed in a sentence without its full stop, "" where none did; `alone`: nothing else
+    changed."""
     parts = []
     for name, one in levels.items():
         low, high = one["interval"]

@@ -1,8 +1,7 @@
 """Costs and normal equations of many parameter sets at once, computed where the replay runs.
 
-Residuals of thousands of replays are larger than what they are wanted for: a cost, a gradient and a Hessian for each
-set. On an accelerator they are whitened, differenced and summed there, in one compiled function with the replay, so
-that only those sums come back.
+On an accelerator residuals are whitened, differenced and summed in one compiled function with the replay, so that only
+a cost, a gradient and a Hessian of each set come back.
 """
 
 from __future__ import annotations
@@ -140,8 +139,7 @@ def summed_there(replay: Any) -> bool:
 
 
 def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) -> None:
-    """Let an accelerator compile side by side what a search by these objectives will need, and what it fetches of a
-    replay with values (P,); a processor compiles in seconds what it comes to."""
+    """Compile side by side what a search by these objectives needs of a replay with values (P,), on an accelerator."""
     if summed_there(replay):
         _COMPILERS.submit(replay.simulate, values[None])
         for objective in objectives:

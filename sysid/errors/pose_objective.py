@@ -1,9 +1,8 @@
 """What is minimised: the paper's J (sum of position RMSE), and a weighted least-squares residual over all channels.
 
-The residual of a channel is divided by its noise scale: the spread between replicates where the log has them, else a
-stated default that is replaced by the residual's own size after a first fit. The start pose of a trial is itself
-measured with noise; its three errors enter the residual linearly, so they are solved for in closed form with that
-noise as prior.
+A channel's residual is divided by its noise scale: the spread between replicates, else a default that the residual's
+own size replaces after a first fit. The three errors of a measured start pose enter linearly and are solved for in
+closed form, with that noise as prior.
 """
 
 from __future__ import annotations
@@ -122,8 +121,8 @@ class Objective:
 
     @cached_property
     def _rates(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Of the gyro's samples, one over the time between each and the next (B, G - 1, 1), and 1 where both are there;
-        None without a gyro."""
+        """One over the time between samples of the gyro (B, G - 1, 1), and 1 where both are there; None without a
+        gyro."""
         one = self.measured
         if one.gyro_t is None or one.gyro_mask is None or self.noise.gyro is None:
             return None
@@ -297,9 +296,8 @@ class Objective:
         """Residual and Jacobian after the best start-pose error of each trial, with that error itself appended.
 
         A start error n = (dx, dy, dyaw) moves the simulated pose by A n; n minimises |r + A n|^2 + |n / sigma|^2, a
-        linear map of r that is applied to the Jacobian as well. Samples that are far off (`gradient.HUBER`) weigh less
-        in it: one start must not follow them, when all samples suffer from it. The odometry, which is counted from its
-        own standstill, has such an error of its own.
+        linear map of r that is applied to the Jacobian as well. Samples that are far off (`robust.HUBER`) weigh less in
+        it. The odometry, which is counted from its own standstill, has such an error of its own.
         """
         noise, starts = self.noise, [trial.start for trial in self.trials]
         begin, xp = 0, namespace(simulated.pose)
@@ -337,14 +335,8 @@ class _StartError:
 
     @classmethod
     def of(cls, values: Any, origin: np.ndarray, weight: np.ndarray, residual: Any) -> _StartError:
-        """That of poses.
-
-        Args:
-            values: (N, B, M, C) of which the first three columns are x, y, yaw.
-            origin: (B, 2) where they start.
-            weight: (B, M, C).
-            residual: (N, B, M C) whitened.
-        """
+        """That of poses: values (N, B, M, C) begin with x, y, yaw; origin (B, 2); weight (B, M, C); residual (N, B, M
+        C) white."""
         arm = namespace(values).nan_to_num(values[..., :2] - origin[:, None, :])
         return cls(arm, weight, huber_weight(residual.reshape(values.shape)[..., :3]))
 

@@ -118,12 +118,11 @@ class Space:
         return np.where(self.log, self.to_values(u) * np.log(high / low), self.high - self.low)
 
     def moved(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Unit coordinates (N, P), which may lie outside the range, a step (N, P) from u (N, P): along the valley of
-        all that drives fix per inertia.
+        """Unit coordinates (N, P) a step (N, P) from u (N, P), along the valley of what drives fix per inertia only.
 
         Heavier wheels with as much larger torques drive alike. Torques grow in proportion to an inertia of which the
-        wheels' is one of two terms: in these coordinates that valley is curved, the more so the lighter the vehicle,
-        and a straight step of one standard error leads far up its sides. To first order the step is as it is.
+        wheels' is one of two terms, so that valley is curved, and a straight step leads far up its sides. The first
+        order is unchanged.
         """
         end = u + step
         if self.turned is None or RATIO not in self.names:
@@ -161,8 +160,8 @@ LOSS = 1.5  # 1/s by which bearings may brake a vehicle that rolls, or a feed-fo
 
 
 def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec) -> dict[str, tuple[float, float]]:
-    """Bounds that follow the vehicle: its torques, scrub up to its whole weight sliding at a quarter of the track, and
-    a centre of mass between the axles, above the floor and below where a turn at a third of g would tip it."""
+    """Bounds that follow the vehicle: its torques, scrub up to its whole weight sliding at a quarter of the track,
+    and a centre of mass between the axles, above the floor and below where a turn at a third of g would tip it."""
     scaled = {name: (FACTORS[name][0] * value, FACTORS[name][1] * value)
               for name, value in zip(names, initial, strict=True) if name in FACTORS and value > 0}
     load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # [kg m^2] that one side's motor turns
@@ -176,8 +175,7 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
 def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
     """What a fit searches by default: all but `FIXED`, and the height of the mass where wheels may skid.
 
-    Args:
-        asked: effects that were asked for; lateral damping of driven wheels, which slip besides, is searched only then.
+    `asked`: effects asked for; lateral damping of driven wheels, which slip besides, is searched only then.
     """
     from whill_mjx.vehicle.parameters import describe
 
@@ -191,12 +189,10 @@ def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
 
 
 def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:
-    """Space of a vehicle's parameters, with their described bounds or those of `vehicle_bounds`.
+    """Space of a vehicle's parameters, from their values in `params`, with their described bounds or
+    `vehicle_bounds`.
 
-    Args:
-        params: `VehicleParams`; their values are where the search starts.
-        spec: its nominal geometry and mass.
-        names: what to search; by default everything but `FIXED` and limits that are not there.
+    `names`: what to search; by default everything but `FIXED` and limits that are not there.
     """
     from whill_mjx.vehicle.parameters import describe, get_values
 
@@ -223,10 +219,8 @@ def is_delay(name: str) -> bool:
 
 
 class Residuals(Protocol):
-    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P).
-
-    One whose `equations` are not None has them summed up there.
-    """
+    """Residuals (N, B, K) of unit coordinates (N, P), and derivatives (N, B, K, P); summed up by `equations` unless
+    None."""
 
     @property
     def space(self) -> Space: ...

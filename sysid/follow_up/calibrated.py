@@ -1,10 +1,9 @@
 """What a p-value of the search comes to where nothing is missing.
 
-The p-value of scan and refits assumes that drives differ from the reference days as these do from each other, in what
-columns at the reference say. Real days do so only roughly: small values come too often, and those that a refit takes
-back end at 1. On logs of an independent contact plant with nothing in them the values follow a Beta distribution, whose
-distribution function makes them uniform there. `python -m benchmarks.undeclared --calibrate` fits it; it decides
-nothing, verdicts go by the p-values of the search.
+It assumes that drives differ from the reference days as these do from each other. Real days do so only roughly: small
+values come too often, and those that a refit takes back end at 1. On logs of an independent plant with nothing in them
+they follow a Beta distribution (`python -m benchmarks.undeclared --calibrate` fits it), whose distribution function
+makes them uniform there. It decides nothing: verdicts go by the p-values of the search.
 """
 
 from __future__ import annotations

@@ -42,10 +42,8 @@ def by_manoeuvre(
 ) -> list[dict[str, Any]]:
     """Mean RMSE of each manoeuvre, channel and metric before and after, training and held-out trials apart.
 
-    Returns:
-        Rows of `part`, `manoeuvre`, `channel`, `metric`, `unit`, `before`, `after`, `change`, its 95 % `interval`,
-        `trials`. Intervals are those of trials drawn anew and of blocks of `BLOCK` within each, before and after of a
-        block together.
+    Rows of `part`, `manoeuvre`, `channel`, `metric`, `unit`, `before`, `after`, `change`, its 95 % `interval` and
+    `trials`. Intervals are those of trials drawn anew and of blocks of `BLOCK` within each.
     """
     rng = np.random.default_rng(seed)
     pairs = [(trial, squared_errors(trial, one), squared_errors(trial, other))
@@ -70,11 +68,8 @@ def worse(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def paired(trials: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], rng: np.random.Generator) -> dict[str, Any]:
-    """Mean RMSE before and after, and the interval of the change.
-
-    Args:
-        trials: of each the times (T,), and the squared errors (T,) before and after.
-    """
+    """Mean RMSE before and after, and the interval of the change, from times (T,) and squared errors (T,) of each
+    trial."""
     ends = np.array([[np.sqrt(one[1].mean()), np.sqrt(one[2].mean())] for one in trials]).mean(0)
     drawn = np.stack([_drawn(*one, rng) for one in trials])  # (trials, RESAMPLES)
     picked = rng.integers(0, len(trials), (len(trials), RESAMPLES))

@@ -1,10 +1,10 @@
 """The next drive: the one that separates effects which these drives do not.
 
 Rivals are an accepted effect, the others of its class, and those whose refit came close to it. Each is simulated at its
-own fitted values on every drive of a library. From the difference of two, what base parameters within their day-to-day
-spread and the other's own coordinates can absorb is projected out; what is left, in standard deviations of the noise,
-is how well a drive separates them. The drive with the largest worst case is proposed. All drives last as long as the
-log's longest trial: they go through the replay that the search has compiled.
+own fitted values on every drive of a library. What base parameters within their spread and the other's own coordinates
+can absorb is projected out of the difference of two; the rest, in standard deviations of the noise, is how well a drive
+separates them. The drive with the largest worst case is proposed; all last as long as the log's longest trial, so that
+they go through the replay that is compiled.
 """
 
 from __future__ import annotations
@@ -133,8 +133,8 @@ def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[
 
 
 def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[PlannedDrive]:
-    """The library: every manoeuvre at several sizes and start headings [degrees], within the speeds, the space and the
-    time that the training trials took up."""
+    """Every manoeuvre at several sizes and start headings [degrees], within speeds, space and time of the training
+    trials."""
     trials = result.log.training
     v = max(max(float(trial.command.v.max()) for trial in trials), 0.1)
     omega = max(float(np.abs(trial.command.omega).max()) for trial in trials) or min(result.log.spec.omega_max, 0.5)
@@ -218,7 +218,7 @@ def separations(
     result: Result, refitter: Refitter, groups: Sequence[Sequence[Rival]], library: Sequence[PlannedDrive]
 ) -> tuple[np.ndarray, list[PlannedDrive]]:
     """Separation (D, pairs) of the most promising drives, and these drives; pairs as in `itertools.combinations` of
-    each group in turn."""
+    groups."""
     flat = [one for group in groups for one in group]
     place = {id(one): i for i, one in enumerate(flat)}
     pairs = [(place[id(a)], place[id(b)]) for group in groups for a, b in combinations(group, 2)]
@@ -267,8 +267,8 @@ def _own_columns(refitter: Refitter, drives: Drives, fit: Refit, at: np.ndarray)
 
 
 def _held(result: Result, fit: Refit) -> np.ndarray:
-    """(P + k, P + k) precision of a rival on a new day: base parameters by the spread, its coordinates by these drives
-    and by how far they seem to wander from day to day."""
+    """(P + k, P + k) precision of a rival on a new day: base by the spread, coordinates by these drives and their
+    wander."""
     size = len(fit.u)
     flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
     matrix = flat.T @ flat

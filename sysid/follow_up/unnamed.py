@@ -1,10 +1,9 @@
 """A wrench without a name for what the catalogue does not have.
 
 A force along the vehicle and a torque about it, as tables over one quantity of the motion, are fitted to what the base
-model leaves. Each knot of a table is switched on by itself at a small size; what that changes in the features is its
-column. The table is a linear regression of the white residual on these columns beside those of the base parameters.
-Which quantity, how smooth, and which sum of few terms stands for the table: manoeuvres that were held back decide. The
-winner is then replayed as the effect `unnamed`. A table over a wheel's angle starts at its own angle in every drive.
+model leaves: a linear regression of the white residual on what each knot changes, beside the base parameters.
+Manoeuvres that were held back decide which quantity, how smooth, and which sum of few terms stands for the table. The
+winner is replayed as the effect `unnamed`. A table over a wheel's angle starts at its own angle in every drive.
 """
 
 from __future__ import annotations
@@ -337,8 +336,7 @@ def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
 
 
 def replay_unnamed(result: Result, found: Unnamed, trials: tuple[Trial, ...]) -> list[Prediction]:
-    """Replays of trials with the wrench. A wheel's start angle is that which fits each trial's reported speeds best,
-    held-out ones too: nothing else shows it."""
+    """Replays of trials with the wrench; a wheel's start angle is that which fits each trial's reported speeds best."""
     batch, measured = make_batch(trials, result.plant.dt, RECORD_DT)
     replay = Replay(result.plant, batch, lambda values: set_values(found.vehicle, ["unnamed.start_angle"], values))
     seen = replay.simulate((PHASES if found.table.quantity in WHEELS else PHASES[:1])[:, None])

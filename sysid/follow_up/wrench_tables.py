@@ -1,8 +1,7 @@
 """Regression of a residual on tables over one quantity, and on sums of few terms that may stand for them.
 
-A table has a force and a torque at each knot. What each knot changes in the white features is a column; all products
-are multiplied out by manoeuvre, so that fitting to some manoeuvres and asking the others is algebra. A table over a
-wheel's angle starts at its own angle in every drive.
+All products of columns (one a knot) are multiplied out by manoeuvre, so that fitting to some and asking the others is
+algebra.
 """
 
 from __future__ import annotations
@@ -54,8 +53,8 @@ class WrenchTable:
 
     @property
     def roughness(self) -> np.ndarray:
-        """(KNOTS, KNOTS) of a table: sum of squares of its second differences, of a map's along both ways, and a bit
-        of its own."""
+        """(KNOTS, KNOTS) of a table: squares of its second differences (a map's along both ways), and a bit of its own.
+        """
         if self.quantity == MAP:
             bend = np.concatenate([np.kron(np.eye(ROWS), _bends(ACROSS)), np.kron(_bends(ROWS), np.eye(ACROSS))])
         else:
@@ -63,8 +62,8 @@ class WrenchTable:
         return np.asarray(bend.T @ bend + SHRINK * np.eye(KNOTS))
 
     def parameters(self, wrench: np.ndarray, start: float = 0.0) -> dict[str, float]:
-        """Parameters of the effect for a table (2 KNOTS,) of forces [N], then torques [N m], and a wheel's start
-        angle [rad]."""
+        """Parameters of the effect for a table (2 KNOTS,) of forces [N], then torques [N m], and a wheel's start angle
+        [rad]."""
         number = list(QUANTITIES).index(self.quantity) + 1
         found = {"quantity": float(number), "low": self.low, "high": self.high, "low_y": self.low_y,
                  "high_y": self.high_y, "with_motion": float(self.kind == "brake"), "start_angle": start}
@@ -105,10 +104,7 @@ class Products:
 def multiplied(
     residual: np.ndarray, jacobian: np.ndarray, columns: np.ndarray, groups: Sequence[Sequence[int]]
 ) -> Products:
-    """Products by groups of trials.
-
-    Args:
-        residual: (B, n); jacobian: (B, n, P) of the base; columns: (B, n, S) of the tables.
+    """Products by groups of trials: residual (B, n), Jacobian (B, n, P) of the base, columns (B, n, S) of the tables.
     """
     design = np.concatenate([jacobian, columns], axis=-1)
     flat = [design[list(group)].reshape(-1, design.shape[-1]) for group in groups]
@@ -154,8 +150,7 @@ def gains_without(products: Products, penalty: np.ndarray, size: int) -> np.ndar
 
 
 def few_terms(products: Products, precision: np.ndarray, table: WrenchTable) -> tuple[np.ndarray, tuple[Term, ...]]:
-    """The best sum of few terms and its gain (G,) on each group, chosen and fitted on the other groups; none for a map.
-    """
+    """The best sum of few terms and its gain (G,) on each group, chosen and fitted on the others; none for a map."""
     if table.quantity == MAP:
         return np.full(len(products.square), -np.inf), ()
     terms = library(table.knots, table.quantity in PERIODIC)
@@ -206,8 +201,8 @@ def turned(table: WrenchTable, columns: np.ndarray, residual: np.ndarray) -> tup
 def from_first_wave(
     terms: Sequence[Term], coefficients: Sequence[np.ndarray]
 ) -> tuple[tuple[np.ndarray, ...], float]:
-    """The same waves counted from where the first of the force rises through zero, as anybody may choose for a wheel;
-    and by how much more every drive then starts [rad]."""
+    """The same waves counted from where the first of the force rises through zero; by how much more drives start [rad].
+    """
     first = next((values for term, values in zip(terms, coefficients, strict=True)
                   if term.form == "harmonic" and term.number == 1), None)
     if first is None:

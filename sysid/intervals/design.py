@@ -65,8 +65,7 @@ def candidate_objective(
 ) -> Objective:
     """Objective over candidates yet to be driven, whose "measurements" are the replay at the space's initial values.
 
-    Args:
-        apply: values (P,) -> the plant's parameters.
+    `apply`: values (P,) -> the plant's parameters.
     """
     sigma = float(noise.pose[0]), float(noise.pose[2])
     trials = tuple(as_trial(candidate, channels=channels, sigma=sigma) for candidate in candidates)
@@ -79,11 +78,7 @@ def candidate_objective(
 
 
 def information(objective: Objective, values: np.ndarray) -> np.ndarray:
-    """(B, P, P) information of each candidate in unit coordinates, with INFLATION taken off.
-
-    Args:
-        values: (P,) those of `candidate_objective`, which its slopes in unit coordinates belong to.
-    """
+    """(B, P, P) information of each candidate in unit coordinates at values (P,), with INFLATION taken off."""
     _, jacobian = objective.jacobian(objective.space.to_unit(values)[None])
     found: np.ndarray = np.einsum("bkp,bkq->bpq", jacobian[0], jacobian[0]) / INFLATION
     return found
@@ -111,12 +106,7 @@ def rank(
     candidates: Sequence[Candidate], found: np.ndarray, prior: np.ndarray, paths: Sequence[np.ndarray],
     starts: Sequence[tuple[float, float, float]], criterion: Criterion = "a",
 ) -> list[Plan]:
-    """Candidates by their information, best first.
-
-    Args:
-        found: (B, P, P) information of each.
-        prior: (P, P) what is known before.
-    """
+    """Candidates by their information `found` (B, P, P), beside what is known before (`prior`, (P, P)), best first."""
     subspace = identifiable_subspace(prior + found.sum(axis=0))
     if not subspace.shape[1]:
         subspace = np.eye(len(prior))
@@ -162,12 +152,9 @@ def propose(
     subject: Subject, limits: Limits | None = None, *, channels: str = "both", criterion: Criterion = "a",
     count: int = 1, names: Sequence[str] | None = None,
 ) -> Proposal:
-    """The next manoeuvres of a vehicle.
+    """The next `count` manoeuvres of a vehicle, chosen one after the other.
 
-    Args:
-        channels: what will be measured.
-        count: how many manoeuvres, chosen one after the other.
-        names: parameters of interest; by default all that a log can determine.
+    `channels`: what will be measured; `names`: parameters of interest, by default all that a log can determine.
     """
     spec, params = subject.spec, subject.params
     limits = limits or Limits(max(spec.v_min, -1.0), min(spec.v_max, 1.0), min(spec.omega_max, 1.0))

@@ -1,19 +1,15 @@
 """Which errors of a log are independent of one another: those of samples, of pieces, of drives, or of places.
 
-Residuals of a driving log are mostly autocorrelated, so that the usual (J^T J)^-1 understates the errors several times.
-Trials are independent drives: the variance is that of their sums (`sysid.intervals.sandwich`), whatever the
-correlation within a
-drive. Where too few trials inform a parameter, or where they happen to differ less than pieces of them do, blocks are
-pieces of trials, and errors are no less than those of independent samples. What replicates share is no noise but what
-the model gets wrong about a manoeuvre; where they share more than chance would have it, manoeuvres are the independent
-blocks. Errors may also be shared at a place of their drives alone: where wheels break away, the mean of many drives is
-not the drive without disturbances. The pieces of a manoeuvre, all its replicates together, are blocks of a further
-kind, and no error is less than either kind has it.
+Residuals of a drive are autocorrelated: the usual (J^T J)^-1 understates errors several times. Trials are independent:
+the variance is that of their sums (`sysid.intervals.sandwich`). Where too few trials inform a parameter, or differ less
+than their pieces do, blocks are pieces, and errors no less than those of independent samples. What replicates share is
+no noise but what the model gets wrong about a manoeuvre: where they share more than by chance, manoeuvres are the
+blocks. Errors may be shared at a place of drives alone, where wheels break away: pieces of a manoeuvre, replicates
+together, are blocks of a further kind.
 
-The widest of several estimates is too wide: by chance one of them exceeds what is true, and intervals of 90 % hold in
-95. How much narrower they may be is found by doing the same again with the errors that were found, the signs of whole
-blocks at random (the wild bootstrap of a studentised estimate). That is done with every kind of blocks, and what needs
-the widest intervals counts. Source: Cameron, Gelbach and Miller (2008).
+The widest of several estimates exceeds the truth by chance: 90 % intervals hold in 95. How much narrower they may be is
+found by a wild bootstrap (signs of whole blocks at random), for every kind of blocks; what needs the widest intervals
+counts. Source: Cameron, Gelbach and Miller (2008).
 """
 
 from __future__ import annotations
@@ -116,14 +112,11 @@ def errors_of(evidence: Information, confidence: float = CONFIDENCE) -> Standard
 
 
 def shared_error(series: np.ndarray, groups: np.ndarray) -> float:
-    """How probable it is that the residuals of independent trials of one group are so much alike.
+    """Probability that residuals (B, K) of independent trials of one group (B,) are so much alike; 1 without such a
+    group.
 
-    Independent trials might as well have had the opposite errors, whatever the correlation within each: their products
-    with one another are compared with those for random signs of the trials. 1 without a group of several trials.
-
-    Args:
-        series: (B, K) residuals, each trial's in its own frame.
-        groups: (B,) number of the group that each is of.
+    Independent trials might as well have had the opposite errors: their products with one another are compared with
+    those for random signs of the trials. Each trial's residuals are in its own frame.
     """
     alike = (groups[:, None] == groups) & ~np.eye(len(groups), dtype=bool)
     if not alike.any():
@@ -155,12 +148,8 @@ def _kinds(evidence: Information, inverse: np.ndarray) -> dict[str, Kind]:
 def _widest(
     kinds: Mapping[str, Kind], scores: np.ndarray, independent: np.ndarray, confidence: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors (N, P) and quantiles (N, P) of scores (N, B, K, P): between drives where they know it, or else
-    within them; no interval is narrower than by any other kind.
-
-    Args:
-        independent: (P,) standard errors if all samples were independent.
-    """
+    """Standard errors (N, P) and quantiles (N, P) of scores (N, B, K, P): between drives where they know it, else
+    within; none is less than by any other kind, or than `independent` (P,) of independent samples."""
     from scipy import stats
 
     deviation = {name: np.sqrt(kind.sandwich.variances(kind.sums(scores))) for name, kind in kinds.items()}
@@ -179,8 +168,8 @@ def _widest(
 def _flipped(
     evidence: Information, kind: Kind, inverse: np.ndarray, random: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """How far estimates are off (N, P), and scores (N, B, K, P) there, with the signs of blocks at random; some of
-    `FLIPS` at a time. Errors are residuals as the sandwich corrects them."""
+    """How far estimates are off (N, P), and scores (N, B, K, P) there, with random signs of blocks; some `FLIPS` at a
+    time."""
     moves = kind.sandwich.moves[kind.label]  # (B, K, P, P)
     errors = np.einsum("pr,bkrq,bkq->bkp", np.linalg.inv(inverse), moves, evidence.scores, optimize=True)
     count = max(AT_ONCE // errors.size, 1)

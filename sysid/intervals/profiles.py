@@ -1,10 +1,8 @@
 """Profile likelihoods: how well a log knows one parameter when all others make the best of each of its values.
 
-An interval from curvature at the fitted point is a parabola's; a profile follows walls, valleys and saturation, may be
-one-sided, and shows where a parameter is free of the data. Squares of autocorrelated residuals count more often than
-they inform, so that their increase is divided by as much as the sandwich variance of the parameter exceeds that of
-independent residuals: near its minimum the profile then agrees with the intervals of `sysid.intervals.uncertainty`.
-Source of the scaling: Rotnitzky and Jewell (1990).
+A profile follows walls, valleys and saturation, may be one-sided, and shows where a parameter is free of the data. Its
+increase is divided by what the sandwich variance exceeds that of independent residuals by: near its minimum it agrees
+with `sysid.intervals.uncertainty`. Source of the scaling: Rotnitzky and Jewell (1990).
 """
 
 from __future__ import annotations
@@ -75,15 +73,8 @@ def profile(
     objective: DriveResiduals, at: Minimum, names: Sequence[str], *, points: int = POINTS, iterations: int = ITERATIONS,
     progress: Progress | None = None,
 ) -> list[Profile]:
-    """Profile likelihoods at the fitted point, all points of a grid searched together.
-
-    Args:
-        names: which parameters.
-        points: of the grid, besides the fitted one.
-
-    Raises:
-        ValueError: a name is not searched.
-    """
+    """Profile likelihoods of `names` at the fitted point, all `points` of a grid searched together; ValueError where a
+    name is not searched."""
     space, u, known, robust = objective.space, at.u, at.known, at.robust
     check_names(space, names)
     sd = np.maximum(known.deviation, 1e-8)

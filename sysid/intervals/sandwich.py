@@ -1,10 +1,8 @@
 """Variances of least-squares estimates whose errors are correlated within blocks, and how well those are known.
 
-Contributions to the gradient are added within a block before they are squared, so that any correlation within it
-counts as often as its information; blocks are taken as independent. The residual of a block is smaller than its errors,
-because the estimate follows them: each is divided by the root of what the fit leaves of independent errors, I - H_gg
-(CR2), which is unbiased for those. Few blocks, or few that matter to a parameter, know their own variance badly: its
-degrees of freedom are Satterthwaite's. Source: Bell and McCaffrey (2002); Pustejovsky and Tipton (2018).
+Gradients are added within a block before they are squared. Each block's residual is divided by the root of what the fit
+leaves of independent errors, I - H_gg (CR2, unbiased for those). Few blocks know their own variance badly: its degrees
+of freedom are Satterthwaite's. Source: Bell and McCaffrey (2002); Pustejovsky and Tipton (2018).
 """
 
 from __future__ import annotations
@@ -36,12 +34,7 @@ class Sandwich:
 
 
 def sandwich(blocks: np.ndarray, inverse: np.ndarray) -> Sandwich:
-    """The variances of a minimum of squares.
-
-    Args:
-        blocks: (G, P, P) J_g^T J_g of each block.
-        inverse: (P, P) of their sum, or of a larger matrix.
-    """
+    """The variances of a minimum of squares, from J_g^T J_g (G, P, P) of blocks and the inverse (P, P) of their sum."""
     value, vector = np.linalg.eigh(inverse)
     half = (vector * np.sqrt(np.maximum(value, 0.0))) @ vector.T
     share, axes = np.linalg.eigh(half @ blocks @ half)  # (G, P), (G, P, P): of the errors that the estimates follow

@@ -1,7 +1,6 @@
 """Times of receipt against header stamps: clocks that were set in the middle of a bag, and receipt in bursts.
 
-A recorder's messages are read in the order of their times, so that a clock that was set back shows in no stream alone.
-Against the header stamps it does: the lateness of receipt changes at once, and stays so.
+Messages are read in the order of their times, so a clock that was set back shows only against the header stamps.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ class Step:
 def find_step(received: np.ndarray, stamped: np.ndarray) -> Step | None:
     """The largest step of one clock against the other, from times (T,) [s] of each message; None where there is none.
 
-    In the order of a clock that was set back, messages of two moments are mixed, and no clear step is seen. It is seen
-    in both orders where a clock was set forward.
+    A clock that was set back mixes messages of two moments in its own order; one that was set forward shows in both
+    orders.
     """
     by_stamp, at = _largest_change(received, stamped, np.argsort(stamped, kind="stable"))
     by_receipt, also_at = _largest_change(received, stamped, np.argsort(received, kind="stable"))

@@ -139,11 +139,7 @@ def size_of(role: str, unit: str) -> float:
 
 
 def read_decision(text: str, tables: Sequence[Table]) -> Column:
-    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it.
-
-    Raises:
-        ValueError: naming the text, the rule and the remedy.
-    """
+    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it; ValueError where it is none."""
     role, equals, rest = text.partition("=")
     role, rest = role.strip(), rest.strip()
     if not equals or role not in ROLES:
@@ -168,11 +164,9 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
 def guess(
     tables: Sequence[Table], said: Sequence[Column] = (), units: Mapping[tuple[str, str], str] | None = None
 ) -> list[Column]:
-    """What the columns of the files of one drive hold, as far as names and numbers show it.
+    """What the columns of the files of one drive hold, as far as names and numbers show it; what is `said` is kept.
 
-    Args:
-        said: what is known already; it is kept.
-        units: units that other drives of the source show, by role and name of the column.
+    `units`: units that other drives of the source show, by role and name of the column.
     """
     found = list(said)
     taken = {(one.file, one.name) for one in said}
@@ -199,8 +193,8 @@ def guess(
 
 
 def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:
-    """Unit of each column, by role and name, that most drives show. A drive shows none where nothing moves; one that
-    shows its unit for sure counts a little more."""
+    """Unit of each column, by role and name, that most moving drives show; one that shows it for sure counts a little
+    more."""
     votes: dict[tuple[str, str], Counter[str]] = {}
     for columns in drives:
         for one in columns:
@@ -210,8 +204,7 @@ def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str
 
 
 def _origin_counts(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
-    """Poses of which no name says whether they are odometry's are so where they begin at the origin, as odometry does;
-    elsewhere nobody can know."""
+    """Poses whose names do not say so are odometry's if they begin at the origin; elsewhere nobody can know."""
     roles = {one.role for one in found}
     words = set(STREAM_WORDS["odometry"])
     nameless = [one for one in found if one.role in ("odometry.x", "odometry.y", "odometry.yaw")

@@ -1,7 +1,7 @@
 """The time-out of a base: how long it drives on where no command comes, from pauses of the commands in a log.
 
-The vehicle responds late, to a command that lapses as to one that is sent. So the time from the last command to half of
-the speed, less that from a command out of rest to half of its speed, is the time-out.
+It is the time from the last command to half of the speed, less that from a command out of rest to half of its speed:
+the vehicle responds equally late to both.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ def command_timeout(trials: Sequence[Trial]) -> Timeout | None:
 
 
 def with_own_timeout(log: Log) -> Log:
-    """The log with the stops that its base makes by itself, where its training trials show them and it states no
-    time-out; a note says how long it is."""
+    """The log with the stops that its base makes by itself, where training trials show them and it states none; with
+    a note."""
     if "command_timeout" in log.fields or log.fields.get("input") == "wheels":
         return log
     found = command_timeout(log.training)

@@ -1,7 +1,7 @@
 """Which way a pose travels in its own frame, beside the speeds that it should have.
 
-In the vehicle's own frame a pose moves forward by v, and to the left and ahead by what a turn adds at a point beside
-the axle. A regression of both on v and omega shows the angle between the pose's x axis and the way it travels.
+It moves forward by v, and to the left and ahead by what a turn adds at a point beside the axle: a regression on v and
+omega shows the angle between the pose's x axis and the way it travels.
 """
 
 from __future__ import annotations
@@ -80,12 +80,8 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
 
 
 def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
-    """Direction in which a pose travels.
-
-    Args:
-        reach: how far from the axle's centre its point may be [m].
-        mirrored: with y negated.
-    """
+    """Direction in which a pose travels; `reach`: how far its point may be from the axle's centre [m]; `mirrored`: y
+    negated."""
     x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
     cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
     along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)

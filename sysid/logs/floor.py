@@ -1,9 +1,8 @@
 """What a floor changes of a vehicle, measured on it without a model of it.
 
-A gyro beside the wheels' speeds shows what share of their difference turns the body, to 1 %. The command beside them
-shows how late they turn and drive, and how far they fall short of it. None of these needs an outside pose. Parameters
-of a physical model that say the same are many, and a log determines their sum only: a turn that falls short is scrub,
-slip or a wider track. Errors are those of blocks of drives that are left out in turn (block jackknife: Kuensch 1989).
+A gyro beside the wheels' speeds shows what share of their difference turns the body, to 1 %; the command beside them
+how late they turn and drive, and how far they fall short. No outside pose is needed. Physical parameters that say the
+same are many, and a log determines their sum only: scrub, slip or a wider track. Block jackknife: Kuensch (1989).
 """
 
 from __future__ import annotations
@@ -196,8 +195,7 @@ class FloorChange:
 
 
 def compared(theirs: Measured, mine: Measured, freedom: float, alpha: float) -> FloorChange | None:
-    """Change from what was measured on one floor to what was measured elsewhere, by errors of so many degrees of
-    freedom; None where both show nothing."""
+    """Change between two floors, by errors of so many degrees of freedom; None where both show nothing."""
     error = np.hypot(mine.error, theirs.error)
     with np.errstate(invalid="ignore", divide="ignore"):
         away = np.where(error > 0, (mine.value - theirs.value) / error, np.nan)

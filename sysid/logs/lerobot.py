@@ -62,11 +62,7 @@ class Episodes:
 
 
 def read(path: Path) -> Episodes:
-    """The episodes of a LeRobotDataset, v3 or v2.
-
-    Raises:
-        ValueError: naming the file, the rule and the remedy; also where pyarrow is not installed.
-    """
+    """The episodes of a LeRobotDataset, v3 or v2; ValueError where it is none or pyarrow is not installed."""
     pq = _parquet(f"{path}: reading a LeRobotDataset")
     try:
         return _read(pq, path)
@@ -107,16 +103,10 @@ def _read(pq: Any, path: Path) -> Episodes:
 
 
 def write(folder: Path, log: Log, fps: int | None = None) -> list[str]:
-    """Write the trials of a log as a LeRobotDataset v3 into an empty folder.
+    """Write the trials of a log as a LeRobotDataset v3 into an empty folder, and return notes.
 
-    Args:
-        fps: frames per second; by default the rate of the measurements.
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: pyarrow is not installed, or trials differ in what was measured.
+    `fps`: frames per second; by default the rate of the measurements. ValueError where pyarrow is not installed, or
+    trials differ in what was measured.
     """
     pq = _parquet("writing a LeRobotDataset")
     trials = (*log.training, *log.held_out)  # so that each split is one range

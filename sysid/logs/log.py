@@ -50,10 +50,7 @@ GYRO_COLUMNS = ("t", "gyro")
 
 
 def load_log(folder: str | Path) -> Log:
-    """Load a driving-log dataset.
-
-    Raises:
-        FileNotFoundError, ValueError: naming the file, the value, the rule and the remedy.
+    """Load a driving-log dataset; FileNotFoundError or ValueError names the file, the value, the rule and the remedy.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -80,11 +77,8 @@ def load_log(folder: str | Path) -> Log:
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
-    """Load and check one trial folder.
-
-    Args:
-        timeout: after which the base stops where no command comes [s]; None where a command holds until the next.
-    """
+    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: it holds the
+    last)."""
     command_columns = read_csv(folder / "command.csv", COMMAND_COLUMNS)
     command = Command(**{name: command_columns[name] for name in COMMAND_COLUMNS})
     odometry = ground_truth = None
@@ -128,12 +122,9 @@ def make_trial(
     name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
     held_out: bool = False,
 ) -> Trial:
-    """A trial with its start: the pose is the mean over the standstill before the first command, at most one second;
-    the odometry is counted from there.
-
-    A trial whose first command already moves starts in motion, at the speeds that the odometry then reports, or at
-    those commanded where there is no odometry. Such a start is known from its first sample alone.
-    """
+    """A trial with its start: the mean pose over at most one second of standstill before the first command; the
+    odometry is counted from there. A first command that already moves starts in motion, at the first sample and the
+    speeds of the odometry, or else those commanded."""
     still = standstill_end(command)
     v, omega = _start_speeds(command, odometry)
     start = Start(v=v, omega=omega, rest=still)
@@ -200,14 +191,9 @@ def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, l
 
 
 def of_file(log: Log, spec: VehicleSpec, place: str) -> Log:
-    """The log of the vehicle of a file: sizes and inertias that no dataset states, such as those of a fitted robot, are
-    the file's. Limits of commands stay the log's.
+    """The log of the vehicle of a file: sizes and inertias are the file's, limits of commands stay the log's.
 
-    Args:
-        place: the file.
-
-    Raises:
-        ValueError: wheels or drive differ.
+    ValueError where wheels or drive differ; `place` is the file, named in it.
     """
     check_same_vehicle(log, spec, place, "The vehicle file must be of the same vehicle",
                        ("wheel_radius", "track", "drive"))
@@ -221,13 +207,8 @@ def check_same_vehicle(
     log: Log, spec: VehicleSpec, place: str, rule: str,
     names: tuple[str, ...] = ("wheel_radius", "track", "wheelbase", "drive"),
 ) -> None:  # fmt: skip
-    """Raise ValueError where a vehicle of another geometry is given beside a log.
-
-    Args:
-        place: where it was given.
-        rule: the rule that is broken, in words.
-        names: fields of the spec that must agree.
-    """
+    """Raise ValueError where a vehicle given beside a log differs in a field of `names`; it names `place` and the
+    `rule`."""
     for name in names:
         mine, theirs = getattr(log.spec, name), getattr(spec, name)
         if mine != theirs:
@@ -262,11 +243,8 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 
 def _check_seconds(folder: Path, times: dict[str, np.ndarray]) -> None:
-    """Rows must not be as far apart as no recording's are: this finds milliseconds and smaller units.
-
-    Args:
-        times: of each file (T,).
-    """
+    """Refuse rows that are as far apart as no recording's are, in times (T,) of each file: milliseconds or smaller
+    units."""
     steps = {name: float(np.median(np.diff(t))) for name, t in times.items() if len(t) > 1}
     spans = {name: float(t[-1] - t[0]) for name, t in times.items() if len(t) > 1}
     for name, t in times.items():

@@ -88,11 +88,7 @@ def mrclam_files(folder: Path, robot: str, kind: str) -> list[Path]:
 
 
 def mrclam_robots(keys: Sequence[str]) -> tuple[int, ...]:
-    """Numbers of the robots that selections name: robot1 or one of its trials.
-
-    Raises:
-        ValueError: one names none.
-    """
+    """Numbers of the robots that selections name: robot1 or one of its trials; ValueError where one names none."""
     robots = [key.split("/")[0] for key in keys]
     for key, robot in zip(keys, robots, strict=True):
         if robot not in ROBOTS:
@@ -120,11 +116,7 @@ def drive_files(folder: Path) -> dict[str, Path]:
 
 
 def drive_selection(folder: Path, keys: Sequence[str]) -> tuple[str, ...]:
-    """Runs that selections name: RUN, one of its trials, or GROUP.
-
-    Raises:
-        FileNotFoundError: one names none.
-    """
+    """Runs that selections name: RUN, one of its trials, or GROUP; FileNotFoundError where one names none."""
     runs = drive_files(folder)
     chosen: list[str] = []
     for key in keys:
@@ -142,18 +134,16 @@ def drive_group(run: str) -> str:
 
 
 def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
-    """Load DRIVE runs of one robot.
+    """Load DRIVE runs of one robot from a folder of .npz and .csv.gz files: a trial per window, named
+    RUN/STEP.WINDOW.
 
     Args:
-        folder: folder with the .npz and .csv.gz files.
         runs: file stems, or groups of them, e.g. ("warthog_sand_1",).
         chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the motion
             is then that of wheels and gyro, by its probability, and the note on the log states how often and how much.
 
-    Returns:
-        One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window and
-        `fields["yaw_rate"]` all of it: times [s] and rates [rad/s].
-        `fields["pose_stamps"]` is "receipt": how old a pose is at its stamp is not known.
+    `fields`: "gyro" has the mean gyro yaw rate of each window, "yaw_rate" all of it (times [s], rates [rad/s]), and
+    "pose_stamps" is "receipt": how old a pose is at its stamp is not known.
     """
     folder = Path(folder)
     runs, files = drive_selection(folder, runs), drive_files(folder)
@@ -404,10 +394,8 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
 
 
 def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
-    """Numbers by column (nan where there is none), times and whether calibrating, of a continuous log.
-
-    Its first row is filler and left out.
-    """
+    """Numbers by column (nan where none), times and whether calibrating, of a continuous log after its first row, a
+    filler."""
     rows = csv_rows(path, read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}."))
     header = next(rows, (0, []))[1]
     for name in (*CONTINUOUS_COLUMNS, "ros_time", "calib_state"):

@@ -108,18 +108,17 @@ def relative_pose(stream: PoseStream, start: Start) -> np.ndarray:
 
 
 def replicate_groups(trials: tuple[Trial, ...]) -> list[list[Trial]]:
-    """Trials that are true replicates: of one manoeuvre with the same commands at the same times after its first
-    motion, two at least."""
+    """Trials that are true replicates: of one manoeuvre with the same commands after its first motion, two at least."""
     numbered = [trial for trial in trials if trial.name != trial.manoeuvre == manoeuvre_of(trial.name)]
     return [[numbered[i] for i in group] for group in same_course(numbered) if len(group) > 1]
 
 
 def replicate_noise(trials: tuple[Trial, ...]) -> dict[str, np.ndarray] | None:
-    """Pooled standard deviation between replicates, which no model of the mean motion can beat.
+    """Pooled standard deviation between replicates, which no model of the mean motion can beat; None without
+    replicates.
 
-    Returns:
-        "ground_truth" (3,) of x, y [m], yaw [rad] and "odometry" (5,) of x, y, yaw, v, omega, in the frame of each
-        trial's start; channels without data are nan. None when there are no replicates.
+    "ground_truth" (3,) of x, y [m], yaw [rad] and "odometry" (5,) of x, y, yaw, v, omega, in the frame of each trial's
+    start; channels without data are nan.
     """
     groups = replicate_groups(trials)
     if not groups:
@@ -162,10 +161,10 @@ def noise_floor(trials: tuple[Trial, ...]) -> dict[str, dict[str, float | None]]
 
 
 def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, float | None]]:
-    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by.
+    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by; else
+    empty.
 
-    A manoeuvre's replicates count whichever part they are in: a single held-out drive has its replicates among the
-    training trials, and drives that turn a lot differ by far more than others. Empty where no drive has any.
+    Replicates count whichever part they are in: drives that turn a lot differ by far more than others.
     """
     manoeuvres = [one.manoeuvre for one in trials if one.held_out is held_out]
     each = {name: noise_floor(tuple(one for one in trials if one.manoeuvre == name)) for name in set(manoeuvres)}

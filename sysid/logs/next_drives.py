@@ -1,7 +1,6 @@
 """The next three drives of a log: manoeuvres that show what it lacks, slow, ramped and within a stated space.
 
-They are scripts, `t,v,omega` as in command.csv, which `bridge.manoeuvre` drives: they keep to the floor as it measures
-it. No vehicle model is asked; `sysid.design` plans with a fitted one.
+They are scripts, `t,v,omega` as in command.csv, for `bridge.manoeuvre`. No vehicle model is asked.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ SIZES = (1.0, 0.7, 0.5, 0.35)  # of the speeds that are tried where the floor is
 LONGEST = 20.0  # s of motion
 DT = 0.1  # s between commands
 UNCERTAINTY, REACTION = 0.15, 0.25
-"""How much faster or slower the vehicle may be than commanded, and for how long [s] it drives on before a stop takes
-effect: those of `bridge.manoeuvre`, so that it takes the scripts."""
+"""How much faster or slower than commanded, and for how long [s] after a stop, the vehicle may drive, as
+`bridge.manoeuvre`."""
 STEP = 0.05  # s of the floor that is needed
 SHARE = 0.5  # of the vehicle's limits that a script uses
 FASTEST = (0.5, 0.8)  # m/s and rad/s that no script exceeds by default
@@ -56,10 +55,9 @@ def next_drives(
     log: Log, blind: Sequence[Blind], space: tuple[float, float] = (4.0, 4.0), v_max: float | None = None,
     radius: float | None = None,
 ) -> list[NextDrive]:
-    """Up to three drives that show what a log lacks, each within the space.
+    """Up to three drives that show the `blind` spots of a log, each within the space.
 
     Args:
-        blind: its blind spots.
         space: length and width of the free floor [m].
         v_max: fastest speed [m/s]; by default half of the vehicle's limit, at most 0.5 m/s.
         radius: of the vehicle around its drive-axle centre [m]; by default that of its nominal body.
@@ -89,11 +87,8 @@ def reach_of_body(spec: VehicleSpec) -> float:
 
 
 def needed_floor(command: Command, radius: float) -> tuple[float, float]:
-    """Length and width of the floor that a vehicle may need for commands, along its first heading and across it [m].
-
-    Speed and yaw rate may each be UNCERTAINTY too large or too small; each place is widened by the body's radius and by
-    what is driven until a stop takes effect.
-    """
+    """Length and width of the floor that a vehicle may need for commands, along its first heading and across it [m]:
+    with errors of UNCERTAINTY, the body's radius, and what is driven until a stop takes effect."""
     t = np.arange(0.0, command.t[-1] + STEP, STEP)
     held = np.maximum(np.searchsorted(command.t, t + 1e-9, side="right") - 1, 0)
     low, high = np.full(2, -radius), np.full(2, radius)

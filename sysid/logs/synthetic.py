@@ -39,13 +39,8 @@ def write_dataset(
     folder: str | Path, spec: VehicleSpec, params: Any, schedule: Schedule = Schedule(), *,  # noqa: B008
     noise: SensorNoise | None = None, plant: Plant | None = None,
 ) -> Path:
-    """Drive the manoeuvres with a vehicle and write the log.
-
-    Args:
-        folder: dataset folder to create.
-        spec, params: the vehicle; `params` holds the planted truth.
-        plant: by default the simulator's vehicle of `spec`.
-    """
+    """Drive the manoeuvres with the vehicle `spec`, `params` (the planted truth), or with `plant`, and write the
+    dataset."""
     folder, noise = Path(folder), noise or SensorNoise()
     random = np.random.default_rng(schedule.seed)
     plant = plant or vehicle_plant(spec)

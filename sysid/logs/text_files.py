@@ -80,15 +80,13 @@ def text_files(source: Path) -> list[list[Path]]:
 def read_drives(
     source: Path, said: Sequence[str], geometry: tuple[float, float], wheels: bool = False
 ) -> tuple[list[TextDrive], list[str]]:
-    """The drives of a CSV file, a TUM file or a folder of them, and notes on what is left out.
+    """The drives of a CSV file, a TUM file or a folder of them, and notes on what is left out; ValueError where none
+    is clear.
 
     Args:
         said: decisions, each ROLE=[FILE/]COLUMN[:UNIT]; the rest is guessed.
         geometry: wheel radius and track [m], of wheel speeds.
         wheels: take measured wheel speeds as the input, and leave commands out.
-
-    Raises:
-        ValueError: in one line, what is not clear, what was guessed and what to give.
     """
     groups: list[tuple[str, list[Table]]] = []
     refused: list[ValueError] = []
@@ -236,11 +234,8 @@ def _cells(line: str, split: str | None) -> list[str]:
 
 
 def _without_preamble(path: Path, data: list[tuple[int, str]], split: str | None) -> list[tuple[int, str]]:
-    """Lines from the first that has as many cells as most: above it a logger may say who it is.
-
-    Raises:
-        ValueError: above the first row stand names, but not as many as the row has cells.
-    """
+    """Lines from the first that has as many cells as most: above it a logger may say who it is. ValueError where the
+    names above it are more or fewer."""
     counts = [len(_cells(line, split)) for _, line in data]
     usual = Counter(counts).most_common(1)[0][0]
     first = counts.index(usual)
@@ -288,8 +283,7 @@ def _numbers(cells: Sequence[str]) -> np.ndarray:
 def _seconds(cell: str, day_first: bool) -> float:
     """Seconds since 1970 of a date with a time of day, since midnight, or of minutes; nan of anything else.
 
-    Args:
-        day_first: a date that does not begin with its year begins with the day, not with the month.
+    `day_first`: a date that does not begin with its year begins with the day, not with the month.
     """
     if match := re.fullmatch(r"(?:(\d{1,2}):(?=\d+:))?(\d{1,2}):(\d{2}(?:[.,]\d+)?)", cell):
         if match[1] or not match[3].isdigit():  # 12:30 may be hours
@@ -536,8 +530,7 @@ def _stream(
 
 
 def _spread(t: np.ndarray) -> np.ndarray | None:
-    """Times (T,) of rows that came evenly, from times that were rounded down to a coarser step; None where they were
-    not."""
+    """Times (T,) of rows that came evenly, from times rounded down to a coarser step; None where they were not."""
     first = np.flatnonzero(np.diff(t, prepend=-np.inf) > 1e-6)
     if len(first) < 3 or len(first) > len(t) / 2:
         return None
@@ -555,8 +548,8 @@ def _spread(t: np.ndarray) -> np.ndarray | None:
 
 
 def _check_clock(file: str, t: np.ndarray) -> list[str]:
-    """Notes on a stream's time (T,), or a refusal where it goes back by more than rows out of order do: sorted, it
-    would mix two moments."""
+    """Notes on a stream's time (T,); ValueError where it goes back by more than rows out of order do: sorted it would
+    mix."""
     steps = np.diff(t)
     if (steps < 0).sum() > len(steps) / 2:
         return [f"{file}: its newest row comes first; its rows are turned round"]

@@ -1,7 +1,6 @@
 """Long drives in windows, each from where the vehicle was measured to be.
 
-Over minutes an open-loop replay drifts by more than any parameter moves it, and a single drive shows no noise: nothing
-was held back from it. Windows of it are drives of their own, as those of the published measured sets are.
+Over minutes an open-loop replay drifts by more than any parameter moves it, and a single drive shows no noise.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ TINY = 1e-9
 
 
 def in_windows(log: Log) -> Log:
-    """The log with its long drives in windows, and a note where there are any. Drives that are repeated stay whole:
-    they show the noise."""
+    """The log with its long drives in windows, and a note. Repeated drives stay whole: they show the noise."""
     if all(trial.duration < LONG for trial in log.trials):
         return log
     again = {log.trials[i].name for group in same_course(log.trials) if len(group) > 1 for i in group}

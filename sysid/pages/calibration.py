@@ -21,13 +21,10 @@ UNKNOWN = ("Without an outside pose this log does not separate errors of wheel r
 def calibration_notes(
     estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial], kept: Sequence[str] = ()
 ) -> list[str]:
-    """Sentences on radius, track, the odometry's scales and the tracked point; those that a log leaves open are named.
+    """Sentences on radius, track, the odometry's scales and the tracked point; those that a log leaves open are
+    named.
 
-    Args:
-        estimates: of all fitted parameters.
-        spec: with the stated radius and track.
-        trials: that were fitted.
-        kept: groups that keep their stated values (`sysid.search.stated`).
+    `kept`: groups that keep their stated values (`sysid.search.stated`).
     """
     notes = _notes(estimates, spec, trials)
     if kept:

@@ -40,12 +40,7 @@ SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
 
 
 def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[Section]:
-    """All sections of the report of a fit.
-
-    Args:
-        report: content of report.json (keys in `sysid.report`).
-        series: motion of the trials; without any, the charts are left out.
-    """
+    """All sections of the report of a fit (entries: docs/formats.md); without `series`, the charts are left out."""
     drawn = choose(series)
     sections = [Section("Summary", summary(report, series)), Section("Parameters", parameters(report))]
     if report.get("profiles"):

@@ -1,4 +1,4 @@
-"""What a fit writes besides its pages: report.json (keys in `sysid.report`), and the origin in its vehicle file."""
+"""What a fit writes besides its pages: report.json (entries: docs/formats.md), and the origin in its vehicle file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Loaded:
 
 
 def make_report(data: Loaded, config: FitConfig, fit: Fit, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The report of a fit (keys in `sysid.report`)."""
+    """The report of a fit (entries: docs/formats.md)."""
     log = data.log
     about = describe_parameters(fit.params)
     parameters = [
@@ -106,7 +106,7 @@ def fit_dataset(
     path: str | Path | Loaded, out: str | Path, quick: bool = False, config: FitConfig | None = None,
     progress: Progress | None = None, model: Model | None = None,
 ) -> dict[str, Any]:
-    """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
+    """Fit a dataset and write report.json (returned), report.html, plots and vehicle.toml into the folder `out`.
 
     Of another model than the simulator's vehicle, model.toml is written, model.xml where it came from an MJCF or URDF
     file, and vehicle.toml where a vehicle of the simulator drives alike.
@@ -115,9 +115,6 @@ def fit_dataset(
         path: dataset folder, or a log that was read before.
         quick: overrides `config.quick` where true.
         model: as of `fit_log`.
-
-    Returns:
-        The report.
     """
     from sysid.pages.plots import write_plots
     from whill_mjx.vehicle.vehicle_file import save_vehicle

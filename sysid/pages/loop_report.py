@@ -1,63 +1,4 @@
-"""The report of a closed loop: `report.json` (versioned, below), the page, the vehicle file with the effect in it.
-
-    schema, kind      1, "sysid-close-loop"
-    verdict, reason   "named", "none" or "unexplained", and why in one sentence
-    noise             channel -> factor on the noise of the reference days, its 95 % interval, and whether it surely
-                      `changed`; empty without reference days
-    noise_sentence    the channels that changed, null where none did
-    warnings          what speaks against taking a name as certain, in sentences
-    advice            of these, what changes what a reader should do, with a remedy
-    known             whether there is a reference: drives of other days, or a vehicle file
-    question          what was asked: against a reference, or of the model family
-    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, open, unit,
-                      `was` in the vehicle as it was, `neutral`, description}, p_value, equation, evidence; an interval
-                      lies within the physical range, and drives that allow values beyond an end of it leave that end
-                      `open`
-    before            training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
-                      noise_floor of the same where there are replicates: of the same manoeuvres, held out or not. It is
-                      that of the vehicle as it was: none of its parameters has moved
-    refitted, after   the same, refitted to these drives within its day-to-day spread without, and with what was found
-    alone             the same, of the vehicle of `refitted` with only the named effects' own parameters fitted; null
-                      unless named
-    shown             one drive as measured and in these three replays (keys: `sysid.pages.before_after.shown_drive`)
-    change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
-                      resampled trials, and how many trials got worse
-    by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
-                      (`sysid.follow_up.changes`)
-    worse             rows of the same from `refitted` to `after` whose error surely grew
-    missing           p-value of "nothing is missing", against reference days calibrated
-    (`sysid.follow_up.calibrated`), and
-                      `p_search` as the search has it; that of the scan of pairs; squared residual in excess of the
-                      noise, as a share of it, before and after; share `explained` of what could be predicted; of
-                      simulated days that were refitted (`--refit-nulls`, else null) count, calibrated p-value, false
-                      alarms and the upper 95 % bound of their rate
-    forms             per named effect curves over speed, yaw rate and time of how much larger than by its law it is:
-                      `share` of its size `at` values of the quantity, with a 95 % band (`low`, `high`)
-    decision          how the verdict was reached, as the picture of the page shows it; null for drives that stand alone
-    weights           posterior weights of `none` or `noise`, of sets of effects (" + " between them), of `unknown`
-    steps             the sets of effects that were weighed: gain, gain of each effect beside other forms of the others
-                      (`own`) and its p-value, what is left that replicates have in common, smooth functions predict, or
-                      may be at random, and the share explained (`sysid.verdict.posterior.Findings`)
-    operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
-                      of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
-                      the share of simulated days on which it would be noticed, at factors on its size
-    log_doubts        what is wrong with the log itself, in sentences
-    contradicted      what speaks against an effect that would else have been named, in sentences
-    pairs             of the scan: the pairs of effects that explain most together
-    candidates        per round the refitted effects: gain, share of the residual explained, coordinates
-    detectable        per effect the smallest size that these drives would show with 80 % power, and how often it was
-                      noticed on simulated days (`power`)
-    lives_in          where the unexplained residual lives
-    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.follow_up.unnamed.as_report`);
-    where
-                      it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
-    next_manoeuvre    the drive that would separate the effects of a class, written to next_command.csv; null where
-                      there is nothing to separate (keys: `sysid.follow_up.next_manoeuvre.next_manoeuvre`)
-    base              base parameters: reference value, day-to-day spread, value on these drives in the search (`value`)
-                      and after the last refits without and with what was named (`before`, `after`), and how many
-                      spreads that with it is `away`
-    manifest          everything fixed beforehand, and its SHA-256
-"""
+"""What a closed loop writes: `report.json` (entries: docs/formats.md), the page, the vehicle file with the effect."""
 
 from __future__ import annotations
 
@@ -299,10 +240,7 @@ def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
 
 
 def effects(result: Result) -> list[dict[str, Any]]:
-    """The named effects with values, intervals and evidence.
-
-    Values are those of the joint refit that decided; the vehicle file has them after the last refit to whole poses.
-    """
+    """The named effects with values (of the joint refit that decided), intervals and evidence."""
     final, found = result.search.final, result.search
     ends_of = np.stack([intervals(one, result) for one in (final, *beside_still_base(result))])
     low, high = ends_of[:, 0].min(0), ends_of[:, 1].max(0)
@@ -333,8 +271,8 @@ def effects(result: Result) -> list[dict[str, Any]]:
 
 
 def in_range(parameter: str, value: float, ends: Sequence[float]) -> dict[str, Any]:
-    """An interval within the range that is physical for a parameter, and which of its ends the drives leave `open`:
-    they would allow values beyond that range as well. A value beyond it has an interval of its own."""
+    """An interval within a parameter's physical range, and which of its ends the drives leave `open`, as they allow
+    values beyond that range. A value beyond it has an interval of its own."""
     about = about_of(parameter)
     known = [one for one in (about.low, about.high, about.neutral, value) if np.isfinite(one)]
     low, high = sorted(ends)
@@ -360,8 +298,7 @@ def equation_of(one: Hypothesis) -> str:
 
 
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
-    """What each manoeuvre says of an effect by itself, whether it predicts manoeuvres that were left out, and its
-    falsifiers."""
+    """What manoeuvres say of an effect by themselves, whether it predicts those left out, and its falsifiers."""
     one = next((one for one in result.stood if one.effect == effect), None)
     final, groups, precision = result.search.final, result.evidence.groups, result.evidence.precision
     sizes, errors = (one.sizes, one.errors) if one else sizes_apart(final, part, groups, precision)
@@ -379,8 +316,7 @@ def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
 
 
 def form_curves(result: Result) -> dict[str, list[dict[str, Any]]]:
-    """Effect -> curves of how far it is off its law (`sysid.verdict.forms.Deviation`). What its forms leave counts as
-    noise."""
+    """Effect -> curves of how far it is off its law (`forms.Deviation`). What its forms leave counts as noise."""
     found, form = result.search, result.config.thresholds.form
     if found.verdict != "named" or found.findings is None:
         return {}

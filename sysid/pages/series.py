@@ -123,8 +123,7 @@ def _trial_series(path: Path, arrays: dict[str, np.ndarray], index: str, about: 
 def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
     """Series of a run folder without the file: load its dataset and replay the vehicle before and after the fit.
 
-    Raises:
-        FileNotFoundError, ValueError: the dataset has moved or changed since the fit.
+    FileNotFoundError or ValueError where the dataset has moved or changed since the fit.
     """
     import jax
     import jax.numpy as jnp

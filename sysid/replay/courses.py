@@ -36,12 +36,8 @@ class CourseReplay:
 
     def __init__(self, plant: Plant, trials: tuple[Trial, ...], set_values: Callable[[jax.Array], Any],
                  anywhere: bool = True, paths: PathReplay | None = None):
-        """`set_values` turns values (P,) into the vehicle's parameters.
-
-        Args:
-            anywhere: the motion does not depend on where in the room it starts; otherwise every trial is a course.
-            paths: compiled programs of the same plant and `set_values`, of another replay.
-        """
+        """`set_values` turns values (P,) into the vehicle's parameters. Unless the motion is the same `anywhere` in the
+        room, every trial is a course. `paths`: compiled programs of the same plant and `set_values`."""
         batch, self.measured = make_batch(trials, plant.dt)
         command, start = np.asarray(batch.command), np.asarray(batch.start, float)
         self._anywhere, self._record = anywhere, plant.dt * command.shape[2]
@@ -73,8 +69,8 @@ class CourseReplay:
 
     @cached_property
     def in_pieces(self) -> CourseReplay:
-        """The same with drives in pieces side by side (`sysid.replay.pieces`) where it is traced, if they are long,
-        start at rest and may be anywhere."""
+        """The same with drives in pieces side by side where it is traced, if they are long, start at rest and may be
+        anywhere."""
         batch = self._replay.batch
         records, step = batch.command.shape[1], self._record
         count = pieces.count(records * step)

@@ -1,7 +1,4 @@
-"""Effects that a replay takes out of the vehicle, since their law applies to all commands or all records at once.
-
-Within the vehicle every physics step would carry their memory.
-"""
+"""Effects that a replay takes out of the vehicle, since their law applies to all commands or all records at once."""
 
 from __future__ import annotations
 
@@ -21,10 +18,7 @@ LONG = 1e6
 
 
 def without(params: Any, name: str) -> tuple[Any, Any]:
-    """The vehicle without the last of its effects of sensing, where that is the named one, and that effect or None.
-
-    What was recorded is read by its law instead, without a buffer that every step would have to carry.
-    """
+    """The vehicle without the last of its effects of sensing, where that is the named one, and that effect or None."""
     effects = getattr(params, "effects", ())
     last = [effect for effect in effects if hasattr(effect, "sensing")][-1:]
     if not last or getattr(last[0], "name", "") != name:
@@ -33,9 +27,7 @@ def without(params: Any, name: str) -> tuple[Any, Any]:
 
 
 def delay_apart(params: Any) -> tuple[Any, CommandDelay | None]:
-    """The vehicle without the first of its effects on commands, where that is a delay, and that delay or None: every
-    step would carry the changes under way, of which it knows a few only, on an accelerator as a kernel for each number.
-    """
+    """The vehicle without the first of its effects on commands, where that is a delay, and that delay or None."""
     effects = getattr(params, "effects", ())
     first = next((effect for effect in effects if hasattr(effect, "command")), None)
     if not isinstance(first, CommandDelay):

@@ -1,10 +1,9 @@
 """Derivatives of a replay by differences over a share of each parameter's range.
 
-Skidding wheels, torque limits and sampled delays make a motion rough in its parameters: the mean slope over a share of
-the range shows where the motion goes, the derivative at one point need not. Forward mode through a contact solver,
-which stops after a few iterations and switches between sticking and sliding, means nothing at all. A search by
-differences ends at about the costs of one by forward mode in a fraction of the time: replays of many sets fill a
-processor's vectors, tangents do not.
+Skidding wheels, torque limits and sampled delays make a motion rough: the mean slope shows where it goes, the
+derivative at one point need not. Forward mode through a contact solver, which switches between sticking and sliding,
+means nothing. Searches by differences end at about the same costs in a fraction of the time: replays of many sets fill
+vectors, tangents do not.
 """
 
 from __future__ import annotations
@@ -72,8 +71,7 @@ def make_replay(
 ) -> tuple[Replays, Measured]:
     """Replay of trials with the space's parameters, the others as in `params`, and what was measured.
 
-    Args:
-        like: another replay of this plant, space and vehicle, whose compiled programs serve here too.
+    `like`: another replay of this plant, space and vehicle, whose compiled programs serve here too.
     """
     paths = like.replay.paths if isinstance(like, DifferenceReplay) else None
 

@@ -54,8 +54,8 @@ class Twin:
     spec: VehicleSpec
     params: VehicleParams
     shared: Mapping[str, tuple[str, float, float]]
-    """Parameter of the model -> that of the vehicle with its meaning; the value there is a factor times it plus an
-    offset."""
+    """Parameter of the model -> that of the vehicle with its meaning, and the factor and offset that its value takes
+    there."""
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,10 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
                      receipt: bool = False) -> tuple[str, ...]:
     """Effects that a vehicle with slip has in a fit besides those of its preset; they start where they do nothing.
 
-    On a differential drive passive wheels resist sideways with their speed, and their axle may pivot: then the driven
-    wheels alone carry what a turn shifts, and brake by it. Bearings and motors resist with speed (`losses`): while the
-    torque is at its limit nothing makes up for it. A wheel that skids is thrown by its own inertia, of which the
-    rotor of its motor may be the most. Soft springs let a vehicle nod, and its wheels turn with that.
-    Readings of the odometry have an age of their own, which shows against an outside pose; so has an outside pose that
-    is stamped when it is received (`receipt`), which shows against the odometry.
+    On a differential drive passive wheels resist sideways, and their axle may pivot: then the driven wheels alone carry
+    what a turn shifts. Bearings and motors resist with speed (`losses`). A wheel that skids is thrown by its own
+    inertia, mostly its motor's. Soft springs let a vehicle nod. Readings of the odometry have an age, which shows
+    against an outside pose, and so has a pose stamped at `receipt`.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):
         return ()
@@ -123,10 +121,9 @@ def gyro_effects(trials: Sequence[Trial]) -> tuple[str, ...]:
 def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...]) -> tuple[str, ...]:
     """What a usual first calibration finds, where it is known to show: sizes of the wheels, and of what measures them.
 
-    A command fixes how fast wheels turn, an outside pose how far the vehicle comes by that: both together show radii
-    and track. The odometry beside them shows the sizes that it takes for them, and the pose itself which point of the
-    vehicle it follows. Without an outside pose nothing separates them. On a skid drive wheels slip in every turn, and
-    the track has no part of its own in that.
+    Commands and an outside pose together show radii and track, the odometry beside them the sizes that it takes for
+    them, and the pose which point it follows. Without an outside pose nothing separates them. On a skid drive wheels
+    slip in every turn, and the track has no part of its own in that.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):
         return ()
@@ -154,8 +151,8 @@ def effects_around(model: Model, trials: tuple[Trial, ...]) -> tuple[str, ...]:
 
 
 def calibrated(model: Model, trials: tuple[Trial, ...]) -> tuple[Model, tuple[str, ...]]:
-    """A model with `effects_around` it, and names of their parameters that a fit leaves alone: of the limits of
-    acceleration that of each wheel is enough."""
+    """A model with `effects_around` it, and names of their parameters that a fit leaves alone (limits beside wheels'
+    own)."""
     names = effects_around(model, trials)
     limit = make_effects(("acceleration_limit",))[0]
     if limit.name not in names or limit.name in {effect.name for effect in model.params.effects}:
@@ -363,7 +360,7 @@ def with_surroundings(
     """Plant of a bare model: adds the odometry's pose, the effects around it and a guard against what is not finite.
 
     Args:
-        bare: the model by itself, which observes (5,) x, y, yaw of the body, v and omega of the odometry.
+        bare: observes (5,) x, y, yaw of the body, v and omega of the odometry.
         wheel_radius, track: nominal [m]; for effects that count in steps of wheels.
         drive: as in `Host`, where the host steps it more quickly.
     """

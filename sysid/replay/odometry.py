@@ -14,8 +14,7 @@ from whill_mjx.effects.sensor_delay import SensorDelay
 def framed(speeds: jax.Array, time_constant: jax.Array, period: float, dt: float) -> jax.Array:
     """Speeds (R, 2) as an odometry reports them that is computed once a period [s], of true ones every `dt` [s].
 
-    The counts of an encoder give the mean over the period; the low-pass goes on by one step in each. Given as if
-    there were a frame at every record: rows are taken at the times of their frames.
+    An encoder's counts give the mean over the period; the low-pass goes on by one step in each.
     """
     ways = jnp.concatenate([jnp.zeros((1, 2), speeds.dtype), jnp.cumsum((speeds[1:] + speeds[:-1]) / 2 * dt, axis=0)])
     back = period / dt

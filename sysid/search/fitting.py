@@ -100,10 +100,9 @@ def fit_log(
     log: Log, config: FitConfig | None = None, progress: Progress | None = None, params: Any = None,
     model: Model | None = None,
 ) -> Fit:
-    """Fit the training trials of a log.
+    """Fit the training trials of a log; its held-out trials are not looked at.
 
     Args:
-        log: its held-out trials are not looked at.
         params: where the search starts; by default the preset's values for the log's vehicle.
         model: what is fitted in place of the simulator's vehicle; by default what `config.model` names.
     """
@@ -154,8 +153,8 @@ def fit_log(
 def _first_points(
     log: Log, given: Problem, config: FitConfig, stages: Stages
 ) -> tuple[FitResult | None, FitResult | None, np.ndarray]:
-    """Results of the global search and of the one on features, as far as the method has them, and the points (S, P)
-    from which the gradient search starts."""
+    """Results of the global search and of that on features, where the method has them, and points (S, P) that LM starts
+    from."""
     space, objective = given.space, given.objective
     points = least_squares.random_starts(space, config.starts, config.seed)
     if config.method in (*GLOBAL, "both"):
@@ -184,12 +183,8 @@ def choose(
 ) -> DriveResiduals:
     """Choose the last objective of a search, whole poses or motion in bins, with the weight of its prior.
 
-    Least squares of whole poses are efficient where only the sensors err, independently in each sample. Disturbances
-    add up along a drive, so the errors of poses are correlated: motion in bins then holds more information.
-
-    Args:
-        u: (P,) where the search begins, or where that on features ended; a few steps on poses lead on from there.
-        track: of the vehicle [m].
+    Least squares of whole poses are efficient where only the sensors err. Disturbances add up along a drive: motion in
+    bins then holds more information. `u`: (P,) where the search begins or that on features ended; `track` in m.
     """
     if config.method in GLOBAL:
         return objective
@@ -260,8 +255,8 @@ def _training(log: Log, config: FitConfig) -> tuple[Trial, ...]:
 def _subject(
     log: Log, config: FitConfig, trials: tuple[Trial, ...], params: Any = None, model: Model | None = None
 ) -> tuple[Model | None, Plant, Any, Space, dict[str, tuple[float, float]]]:
-    """What is fitted: the model where it is not the simulator's vehicle, its plant, where the search starts, the
-    parameters that are free, and intervals of an earlier vehicle file."""
+    """The model where it is not the simulator's vehicle, its plant, where the search starts, the free parameters, and
+    intervals of an earlier vehicle file."""
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
@@ -332,8 +327,8 @@ def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial,
 
 
 def fitted_plant(spec: VehicleSpec) -> Plant:
-    """The simulator's vehicle with the physics step that fits have by default: for logs with planted truth, since the
-    step is part of a model."""
+    """The simulator's vehicle with a fit's default physics step, which is part of a model: for logs with planted truth.
+    """
     return vehicle_plant(spec, VehicleConfig(physics_dt=FitConfig.physics_dt))
 
 

@@ -14,8 +14,8 @@ AT_WALL = 1e-6
 def normal_sums(
     residual: np.ndarray, jacobian: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Half the gradients (N, P) and half the Gauss-Newton Hessians (N, P, P) of weighted squares of residuals (N, ...)
-    with the derivatives (N, ..., P)."""
+    """Half the gradients (N, P) and Gauss-Newton Hessians (N, P, P) of weighted squares of residuals (N, ...), by
+    derivatives."""
     axes, residual = "abcd"[: jacobian.ndim - 2], residual.reshape(jacobian.shape[:-1])
     pulls, columns = (residual, jacobian) if weight is None else (residual * weight, jacobian * weight[..., None])
     return (np.einsum(f"n{axes}p,n{axes}->np", jacobian, pulls),
@@ -48,12 +48,8 @@ class BoxStep:
     """Share of the largest curvature that is added whatever the damping."""
 
     def points(self, u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any) -> np.ndarray:
-        """The points (N, P) to which steps from u (N, P) lead.
-
-        Args:
-            gradient, hessian: by half, (N, P) and (N, P, P); without N where they are the same for all.
-            damping: (N,), or one for all.
-        """
+        """The points (N, P) to which steps from u (N, P) lead, with half gradients (N, P) and Hessians (N, P, P), or
+        one for all."""
         count, size = u.shape
         reach = self.reach(u) if callable(self.reach) else self.reach
         gradient, low, high, reach, free = (
@@ -207,12 +203,9 @@ class GaussNewton:
         return Tried(points.reshape(count, -1, size), fall.reshape(count, -1) * shares * (2 - shares))
 
     def step(self, state: State, tried: Tried, costs: np.ndarray, exact: Any = True) -> State:
-        """Move to the best of the points, where it costs less.
+        """Move to the best of the points, by their costs (S, D), where it costs less.
 
-        Args:
-            costs: (S, D) of the points.
-            exact: (S,), or one for all: False where the derivatives were not those of the very point, so that failing
-                says nothing.
+        `exact`: False where derivatives were not those of the very point, so that failing says nothing.
         """
         best, rows = np.nanargmin(costs, axis=-1), np.arange(len(costs))
         fallen, easings = state.cost - costs[rows, best], np.array([

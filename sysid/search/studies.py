@@ -24,8 +24,8 @@ from urllib.parse import unquote, unquote_plus
 import numpy as np
 
 BATCH = {"tpe": 4, "cmaes": 16}
-"""Candidates that are asked for and simulated together. Of TPE as many as a processor replays at no loss: the fewer are
-asked for at once, the more is known of those before. Of CMA-ES its population."""
+"""Candidates that are simulated together: of TPE as many as a processor replays at no loss, of CMA-ES its population.
+"""
 STARTUP = 32  # random candidates of TPE before it draws from those that it knows
 LEASE = 600.0
 """Seconds after which a process on another machine that has not been heard of counts as dead."""
@@ -130,14 +130,9 @@ class SharedStudy:
     def __init__(
         self, names: tuple[str, ...], initial: np.ndarray, place: StudyPlace, *, method: str = "tpe", seed: int = 0
     ):
-        """Create or join the study.
+        """Create or join the study of parameters `names` (unit coordinates), which begins at `initial` (P,).
 
-        Args:
-            names: of the parameters, in unit coordinates.
-            initial: (P,) where the search begins.
-
-        Raises:
-            ValueError: the study is of another problem, or the method is unknown.
+        ValueError where the study is of another problem, or the method is unknown.
         """
         import optuna
 
@@ -172,11 +167,8 @@ class SharedStudy:
 
     def run(self, costs: Callable[[np.ndarray], np.ndarray], evaluations: int,
             progress: Callable[[int, str], None] | None = None) -> None:
-        """Ask, simulate and tell until the study has `evaluations` costs, whoever told them.
-
-        Args:
-            costs: unit coordinates (N, P) -> costs (N,); always called with a whole batch.
-        """
+        """Ask, simulate (unit coordinates (N, P) -> costs (N,), whole batches) and tell until the study has so many
+        costs."""
         best = np.inf
         while True:
             self._beat()
@@ -221,8 +213,8 @@ class SharedStudy:
         return len(left)
 
     def table(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """Unit coordinates (N, P) and costs (N,) of all candidates in the order they were asked, and which of them has
-        the initial values."""
+        """Unit coordinates (N, P) and costs (N,) of all candidates in order, and which of them has the initial values.
+        """
         trials = self._study.get_trials(deepcopy=False, states=(self._optuna.trial.TrialState.COMPLETE,))
         trials = sorted(trials, key=lambda trial: trial.number)
         initial = next((i for i, trial in enumerate(trials) if trial.user_attrs.get("initial")), 0)

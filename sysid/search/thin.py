@@ -1,5 +1,4 @@
-"""Thin logs: parameters that a log cannot determine keep their value in a fit, and logs that determine nothing are
-refused. What `sysid.inspect` says of a log binds the fit."""
+"""Thin logs: parameters that a log cannot determine keep their value; logs that determine nothing are refused."""
 
 from __future__ import annotations
 
@@ -36,11 +35,7 @@ def causes(trials: Sequence[Trial]) -> list[str]:
 
 
 def check_moves(log: Log) -> None:
-    """Refuse a log that determines nothing.
-
-    Raises:
-        ValueError: no training trial is commanded to move for a while.
-    """
+    """Refuse a log of which no training trial is commanded to move for a while: it determines nothing."""
     seconds = 0.0
     for trial in log.training:
         command = trial.command

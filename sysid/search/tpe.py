@@ -35,11 +35,7 @@ def fit(
     objective: Objective, space: Space, search: GlobalSearch, place: StudyPlace = StudyPlace(),  # noqa: B008
     progress: Progress | None = None,
 ) -> FitResult:
-    """Minimise over `space`; the initial values are the first candidate.
-
-    Args:
-        objective: errors in unit coordinates of `space`.
-        place: of a study that several processes share; its problem is added to.
+    """Minimise an objective over `space`, from the initial values on; `place` of a study that several processes share.
     """
     costs: Callable[[np.ndarray], np.ndarray] = {
         "weighted": objective.weighted_cost, "paper": objective.paper_cost}[search.cost]
