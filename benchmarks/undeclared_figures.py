@@ -16,7 +16,7 @@ from benchmarks.harness import device_name, figure, provenance, record
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.undeclared_plant import RECORDED, power_sizes
 from benchmarks.undeclared_reference import USUAL, Driven
-from sysid.follow_up.calibrated import FILE, calibrated
+from sysid.follow_up.power import FILE, calibrated
 from sysid.intervals.statistics import upper_rate
 from sysid.pages.report import write_report
 from sysid.verdict import posterior as decision

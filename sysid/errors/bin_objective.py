@@ -21,9 +21,8 @@ from sysid.errors.pose_objective import HUGE, Objective, Replays, append_prior
 from sysid.errors.prior import Prior
 from sysid.errors.space import STEP, Space
 from sysid.logs.records import Trial
-from sysid.replay.arrays import namespace
+from sysid.replay.arrays import Quotients, namespace
 from sysid.replay.cores import cores, on_processor
-from sysid.replay.quotients import Quotients
 from sysid.replay.records import Simulated
 from sysid.search import least_squares
 from whill_mjx.io.steps import steps_of_rows
@@ -151,14 +150,9 @@ class FeatureObjective:
 
     def _white(self, at: np.ndarray) -> np.ndarray:
         xp = namespace(at)
-        white = self._apply(xp.where(xp.isfinite(at), at, 0.0) - self.target)
+        off = xp.where(xp.isfinite(at), at, 0.0) - self.target
+        white = xp.moveaxis(self.whitener.apply(xp.moveaxis(off, 0, -1), self.mask), -1, 0).reshape(*off.shape[:2], -1)
         return xp.where(_bad(at), HUGE * (self.mask > 0).reshape(len(self.mask), -1), white)
-
-    def _apply(self, series: np.ndarray) -> np.ndarray:
-        """White series (N, B, K C) of (N, B, K, C)."""
-        xp = namespace(series)
-        white = xp.moveaxis(self.whitener.apply(xp.moveaxis(series, 0, -1), self.mask), -1, 0)
-        return white.reshape(*white.shape[:2], -1)
 
 
 def _bad(at: np.ndarray) -> np.ndarray:

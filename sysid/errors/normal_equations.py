@@ -16,8 +16,8 @@ import numpy as np
 
 from sysid.errors.robust import huber_weight, robust_cost
 from sysid.errors.space import STEP, Space
+from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_processor
-from sysid.replay.quotients import Quotients
 from sysid.replay.records import Simulated
 
 DRIVES = 32768

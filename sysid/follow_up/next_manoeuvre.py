@@ -27,7 +27,7 @@ from sysid.missing.joint_fit import Start as FitStart
 from sysid.missing.refit import Refitter, own_sizes
 from sysid.missing.signatures import base_columns
 from sysid.pages.loop_words import command_of
-from sysid.replay.quotients import Quotients
+from sysid.replay.arrays import Quotients
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import refitter_of
 from whill_mjx.effects import EFFECTS, card_of

@@ -1,15 +1,25 @@
-"""What these very drives can show: how often they raise a false alarm, and how surely an effect is noticed.
+"""What these very drives can show: how often they raise a false alarm, how surely an effect is noticed, and
+what a p-value of the search comes to where nothing is missing.
 
 Days with nothing missing are simulated as the nulls of the scan are, but drawn anew; an effect adds its columns.
 Linear, like the scan: `--refit-nulls` measures the false alarms of the whole procedure.
+
+The p-value of the search assumes that drives differ from the reference days as these do from each other. Real days do
+so only roughly: small values come too often, and those that a refit takes back end at 1. On logs of an independent
+plant with nothing in them they follow a Beta distribution (`benchmarks.undeclared --calibrate` fits it), whose
+distribution function makes them uniform there. It decides nothing: verdicts go by the p-values of the search.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
@@ -91,3 +101,19 @@ def smallest(days: Days, alpha: float, effects: Sequence[Effect]) -> list[tuple[
         if number < HALVINGS:
             low, high = np.where(power < POWER, factor, low), np.where(power < POWER, high, factor)
     return [(float(factor), float(share)) for factor, share in zip(high, power, strict=True)]
+
+
+FILE = Path(__file__).parents[1] / "data/null_p.json"
+"""The shape of the distribution, and the logs that it rests on."""
+
+
+def calibrated(p: float) -> float:
+    """Share of days with nothing missing on which the search has a p-value as small as this one."""
+    return float(stats.beta.cdf(p, *shape()))
+
+
+@cache
+def shape() -> tuple[float, float]:
+    """a and b of the Beta distribution that p-values follow where nothing is missing; 1 and 1 would be uniform."""
+    content = json.loads(FILE.read_text())
+    return float(content["a"]), float(content["b"])

@@ -17,20 +17,22 @@ import numpy as np
 
 from sysid.follow_up.wrench_tables import (
     Products,
+    Term,
     WrenchTable,
+    columns_of,
     few_terms,
     from_first_wave,
     held_back,
+    in_words,
     multiplied,
     penalties,
     turned,
 )
-from sysid.follow_up.wrench_terms import Term, columns_of, in_words
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
+from sysid.replay.arrays import Quotients
 from sysid.replay.models import with_effects
-from sysid.replay.quotients import Quotients
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try

@@ -125,7 +125,8 @@ def make_trial(
     """A trial with its start: the mean pose over at most one second of standstill before the first command; the
     odometry is counted from there. A first command that already moves starts in motion, at the first sample and the
     speeds of the odometry, or else those commanded."""
-    still = standstill_end(command)
+    moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
+    still = float(min(command.t[moving[0]] if len(moving) else np.inf, command.t[0] + STANDSTILL))
     v, omega = _start_speeds(command, odometry)
     start = Start(v=v, omega=omega, rest=still)
     if ground_truth is not None:
@@ -143,13 +144,6 @@ def make_trial(
         cos, sin = np.cos(yaw0), np.sin(yaw0)
         odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
     return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
-
-
-def standstill_end(command: Command) -> float:
-    """Time of the first command to move, at most one second after the first command [s]."""
-    moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
-    first = command.t[moving[0]] if len(moving) else np.inf
-    return float(min(first, command.t[0] + STANDSTILL))
 
 
 def read_csv(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:

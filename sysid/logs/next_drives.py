@@ -15,7 +15,6 @@ import numpy as np
 from sysid.logs.coverage import Blind
 from sysid.logs.manoeuvre_library import FRACTIONS, REVERSING, make_command
 from sysid.logs.records import Command, Log
-from whill_mjx.vehicle.specs import VehicleSpec
 
 COUNT = 3
 RAMPS = (0.5, 1.0)  # m/s^2 and rad/s^2 that no script exceeds
@@ -64,7 +63,8 @@ def next_drives(
     """
     v = v_max or min(SHARE * log.spec.v_max, FASTEST[0])
     speeds = v, min(SHARE * log.spec.omega_max, FASTEST[1])
-    radius = radius or reach_of_body(log.spec)
+    body = math.hypot(log.spec.body_length, log.spec.body_width / 2)  # wherever the axle is
+    radius = radius or math.ceil(20 * body) / 20
     causes = {one.cause for one in blind}
     wanted = {name: cause for cause, name in reversed(CURES.items()) if cause in causes}
     order = [(name, wanted[name]) for name in dict.fromkeys(CURES.values()) if name in wanted]
@@ -79,11 +79,6 @@ def next_drives(
         if drive is not None and len(found) < COUNT:
             found.append(drive)
     return found
-
-
-def reach_of_body(spec: VehicleSpec) -> float:
-    """Distance from the drive-axle centre that no part of the body is beyond, wherever the axle is [m]."""
-    return math.ceil(20 * math.hypot(spec.body_length, spec.body_width / 2)) / 20
 
 
 def needed_floor(command: Command, radius: float) -> tuple[float, float]:

@@ -144,7 +144,7 @@ def read_table(path: Path) -> Table:
     comments = [line.lstrip("#% \t") for _, line in lines if line.lstrip().startswith(("#", "%"))]
     if not data:
         raise ValueError(f"{path}: no rows. Give a table of numbers with a line of names.")
-    split = _splitter(data[len(data) // 2][1])
+    split = next((one for one in ("\t", ";", ",") if one in data[len(data) // 2][1]), None)  # None: spaces
     data = _without_preamble(path, data, split)
     if stacked := _stacked_names([_cells(line, split) for _, line in data[:PREAMBLE]]):
         header, data = stacked[0], data[stacked[1] :]
@@ -218,11 +218,6 @@ def _without_separators(cells: Sequence[str]) -> list[str]:
 def _texts(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()
                   and not path.name.lower().startswith(("readme", "license", ".")))
-
-
-def _splitter(line: str) -> str | None:
-    """Separator of a line's cells; None for spaces."""
-    return next((one for one in ("\t", ";", ",") if one in line), None)
 
 
 def _cells(line: str, split: str | None) -> list[str]:

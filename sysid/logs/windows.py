@@ -34,23 +34,18 @@ def in_windows(log: Log) -> Log:
         if trial.duration < LONG or trial.name in again:
             trials.append(trial)
             continue
-        parts = windows_of(trial)
+        length = length_of(trial)
+        every = [_window(trial, k, length) for k in range(round(trial.duration / length))]
+        parts = [one for one in every if one is not None]
         trials += parts
         notes.append(f"{trial.name} lasts {trial.duration:.0f} s: it is taken as {len(parts)} windows of "
-                     f"{length_of(trial):.3g} s, each from where it was measured to be")
+                     f"{length:.3g} s, each from where it was measured to be")
     return replace(log, trials=tuple(trials), notes=tuple(notes))
 
 
 def length_of(trial: Trial) -> float:
     """Length of a trial's windows [s]: it is cut into equal ones, so that nothing of its end is lost."""
     return trial.duration / np.ceil(trial.duration / WINDOW - TINY)
-
-
-def windows_of(trial: Trial) -> list[Trial]:
-    """Windows of a trial that have anything to score, in order."""
-    length = length_of(trial)
-    found = [_window(trial, k, length) for k in range(round(trial.duration / length))]
-    return [one for one in found if one is not None]
 
 
 def _window(trial: Trial, number: int, length: float) -> Trial | None:

@@ -15,7 +15,7 @@ from sysid.logs.records import Trial
 from sysid.missing.days import difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
-from sysid.replay.quotients import Quotients
+from sysid.replay.arrays import Quotients
 from sysid.replay.records import Measured, Simulated
 from sysid.search import least_squares
 

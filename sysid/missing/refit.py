@@ -14,8 +14,8 @@ from sysid.missing.days import Reference, difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit, Start
+from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_all_cores
-from sysid.replay.quotients import Quotients
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from whill_mjx.io.steps import step
 

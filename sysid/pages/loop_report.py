@@ -14,19 +14,10 @@ import jax
 import numpy as np
 
 from sysid.errors.noise_level import said
-from sysid.follow_up.calibrated import calibrated
+from sysid.follow_up import trust
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
-from sysid.follow_up.power import DRAWS, POWER, SEED, Days, false_alarms, power_curve, smallest
-from sysid.follow_up.trust import (
-    CONFIDENCE,
-    advice,
-    as_good_as_repeats,
-    beside_still_base,
-    contradicted,
-    intervals,
-    warnings,
-)
+from sysid.follow_up.power import DRAWS, POWER, SEED, Days, calibrated, false_alarms, power_curve, smallest
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
 from sysid.logs.coverage import doubts
 from sysid.logs.metrics import METRICS, own_floor
@@ -82,8 +73,8 @@ def make_report(result: Result) -> dict[str, Any]:
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
         "noise": noise, "noise_sentence": said(noise, same) or None,
-        "warnings": warnings(result),
-        "advice": advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
+        "warnings": trust.warnings(result),
+        "advice": trust.advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
         "remark": result.reference.remark,
         "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
                     "training": [t.name for t in result.log.training],
@@ -96,7 +87,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "alone": alone(result, trials, before), "change": change(rows),
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
-        "log_doubts": doubts(result.log), "contradicted": contradicted(result), "pairs": pairs_of(result),
+        "log_doubts": doubts(result.log), "contradicted": trust.contradicted(result), "pairs": pairs_of(result),
         "missing": missing(result),
         "weights": found.weights, "steps": steps(result),
         "forms": form_curves(result), "decision": (
@@ -136,7 +127,7 @@ def predicts_well(trials: tuple[Trial, ...], rows: list[dict[str, Any]]) -> bool
     mine = [row for row in rows if row["held_out"] is held and "trajectory" in row["metrics"]]
     channel = "ground_truth" if any(row["channel"] == "ground_truth" for row in mine) else "odometry"
     errors = np.array([row["metrics"]["trajectory"]["fitted"] for row in mine if row["channel"] == channel])
-    return as_good_as_repeats(errors, (own_floor(trials, held).get(channel) or {}).get("trajectory"))
+    return trust.as_good_as_repeats(errors, (own_floor(trials, held).get(channel) or {}).get("trajectory"))
 
 
 def alone(result: Result, trials: tuple[Trial, ...], before: list[Prediction]) -> dict[str, Any] | None:
@@ -242,7 +233,7 @@ def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
 def effects(result: Result) -> list[dict[str, Any]]:
     """The named effects with values (of the joint refit that decided), intervals and evidence."""
     final, found = result.search.final, result.search
-    ends_of = np.stack([intervals(one, result) for one in (final, *beside_still_base(result))])
+    ends_of = np.stack([trust.intervals(one, result) for one in (final, *trust.beside_still_base(result))])
     low, high = ends_of[:, 0].min(0), ends_of[:, 1].max(0)
     values = dict(zip(result.names, final.values.tolist(), strict=True))
     base, was = base_values(result.full), base_values(result.reference.params)
@@ -261,10 +252,11 @@ def effects(result: Result) -> list[dict[str, Any]]:
                 "parameters": {axis.parameter: {
                     "value": values[axis.parameter],
                     **in_range(axis.parameter, values[axis.parameter], [end[axis.parameter] for end in ends]),
-                    "confidence": CONFIDENCE, "unit": unit_of(axis.parameter), "was": was.get(axis.parameter),
-                    "neutral": about_of(axis.parameter).neutral,
+                    "confidence": trust.CONFIDENCE, "unit": about_of(axis.parameter).unit,
+                    "was": was.get(axis.parameter), "neutral": about_of(axis.parameter).neutral,
                     "description": about_of(axis.parameter).description} for axis in one.axes},
-                "p_value": found.accepted[index].p, "equation": equation_of(one),
+                "p_value": found.accepted[index].p,
+                "equation": equation(EFFECTS[one.effect]) if one.effect in EFFECTS else "",
                 "evidence": evidence_for(result, slice(start, stop), one.effect)})
         start = stop
     return out
@@ -285,16 +277,6 @@ def about_of(parameter: str) -> Parameter:
     """What is known of a dotted parameter before any data."""
     effect, _, name = parameter.partition(".")
     return parameters_of(EFFECTS[effect])[name]
-
-
-def unit_of(parameter: str) -> str:
-    """Unit of a dotted parameter name."""
-    return about_of(parameter).unit
-
-
-def equation_of(one: Hypothesis) -> str:
-    """The equation of the effect."""
-    return equation(EFFECTS[one.effect]) if one.effect in EFFECTS else ""
 
 
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
@@ -357,7 +339,7 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
         value, reach = one.values(factor * q, base)[axis.parameter], factor * q.max() <= axis.limit and power >= POWER
         out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
                     "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
-                    "unit": unit_of(axis.parameter), "power": power})
+                    "unit": about_of(axis.parameter).unit, "power": power})
     return out
 
 
@@ -417,8 +399,7 @@ def wrapped(line: str, width: int) -> str:
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, both pages, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
-    from sysid.pages.loop_page import write_page
-    from sysid.pages.method_page import write_method
+    from sysid.pages.loop_page import write_method, write_page
     from sysid.pages.report import write_report
     from sysid.verdict.posterior import write as write_evidence
     from whill_mjx.vehicle.vehicle_file import save_vehicle

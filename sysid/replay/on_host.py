@@ -14,10 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.replay.cores import on_processor
 from sysid.replay.delays import delay_apart, delayed
 from sysid.replay.records import Batch, Plant, Simulated
-from sysid.replay.rollout import Replay, simulate_one
+from sysid.replay.rollout import simulate_one
 
 FEW, MANY = 4, 32
 """Parameter sets whose commands and readings are computed together: each other number would be compiled."""
@@ -110,10 +109,3 @@ def _moved(motion: jax.Array, start: jax.Array) -> jax.Array:
     x, y = motion[:, 0], motion[:, 1]
     pose = [start[0] + cos * x - sin * y, start[1] + sin * x + cos * y, start[2] + motion[:, 2]]
     return jnp.concatenate([jnp.stack(pose, axis=-1), motion[:, 3:]], axis=-1)
-
-
-def replay_of(plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]) -> Replay | HostReplay:
-    """The quickest replay of a plant here."""
-    if plant.host is not None and on_processor():
-        return HostReplay(plant, batch, set_values)
-    return Replay(plant, batch, set_values)

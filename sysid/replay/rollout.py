@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
-from sysid.replay import odometry, pieces
+from sysid.replay import pieces
 from sysid.replay.cores import on_all_cores, on_processor
-from sysid.replay.delays import delay_apart, delayed, reached, without
+from sysid.replay.delays import delay_apart, delayed, framed, late, reached, without
 from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, TURN, YAW_COLUMNS, Batch, Measured, Plant, Simulated
 from whill_mjx.effects.odometry_lag import OdometryLag
 from whill_mjx.effects.sensor_delay import SensorDelay
@@ -251,13 +251,13 @@ def _as_sensed(plant: Plant, params: Any, commanded: Commanded, path: jax.Array,
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
     if lag is not None and plant.frame:
-        path = path.at[:, SPEEDS].set(odometry.framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
+        path = path.at[:, SPEEDS].set(framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
     turned = path[:, 2]
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "turned"):
             turned = effect.turned(turned, gap)
     if latency is not None:
-        path = path.at[:, ODOMETRY].set(odometry.late(path[:, ODOMETRY], latency, gap))
+        path = path.at[:, ODOMETRY].set(late(path[:, ODOMETRY], latency, gap))
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "outside"):
             path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])

@@ -14,7 +14,7 @@ pytest.importorskip("mujoco")
 from benchmarks import undeclared, undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
 from benchmarks import undeclared_reference as days  # noqa: E402
-from sysid.follow_up import calibrated  # noqa: E402
+from sysid.follow_up import power  # noqa: E402
 from sysid.verdict.result import LoopConfig  # noqa: E402
 
 pytestmark = pytest.mark.quick
@@ -122,7 +122,7 @@ def nulls_of(p_values, sets):
 
 
 def test_uniformity_is_told_of_the_sets_that_did_not_calibrate():
-    skewed = stats.beta.ppf((np.arange(200) + 0.5) / 200, *calibrated.shape())  # uniform when calibrated
+    skewed = stats.beta.ppf((np.arange(200) + 0.5) / 200, *power.shape())  # uniform when calibrated
     even, odd = np.full(200, 1e-3), skewed
     found = undeclared_figures.of_nulls(nulls_of(np.stack([even, odd], 1).ravel(), 4))
     assert found["null_ks_p"]["unit"] == "of 200 logs over 2 sets of reference days"
@@ -139,7 +139,7 @@ def test_another_draw_calibrates_nothing_and_has_sets_of_its_own():
 
 def test_calibration_finds_the_distribution_that_p_values_follow(tmp_path, monkeypatch):
     monkeypatch.setattr(undeclared_figures, "FILE", tmp_path / "null_p.json")
-    monkeypatch.setattr(calibrated, "FILE", tmp_path / "null_p.json")
+    monkeypatch.setattr(power, "FILE", tmp_path / "null_p.json")
     for folder in ("verdicts", "truth"):
         (tmp_path / folder).mkdir()
     drawn = np.random.default_rng(5).beta(0.6, 0.8, 600)
@@ -147,13 +147,13 @@ def test_calibration_finds_the_distribution_that_p_values_follow(tmp_path, monke
         (tmp_path / "truth" / f"null_{i}.json").write_text("{}")
         (tmp_path / "verdicts" / f"null_{i}.json").write_text(json.dumps(one))
     undeclared_figures.calibrate(tmp_path)
-    calibrated.shape.cache_clear()
+    power.shape.cache_clear()
     try:
-        assert calibrated.shape() == pytest.approx((0.6, 0.8), rel=0.2)
-        assert stats.kstest([calibrated.calibrated(p) for p in drawn[1::2]], "uniform").pvalue > 0.05
+        assert power.shape() == pytest.approx((0.6, 0.8), rel=0.2)
+        assert stats.kstest([power.calibrated(p) for p in drawn[1::2]], "uniform").pvalue > 0.05
         assert stats.kstest(drawn[1::2], "uniform").pvalue < 1e-3
     finally:
-        calibrated.shape.cache_clear()
+        power.shape.cache_clear()
 
 
 def test_calibration_asks_for_enough_logs(tmp_path):
