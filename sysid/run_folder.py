@@ -17,8 +17,7 @@ from sysid.search.studies import without_secrets
 from whill_mjx.io.folders import claim_folder
 from whill_mjx.io.steps import keep_steps
 
-STEPS = "steps"
-"""Folder of the steps, in that of the run."""
+STEPS = "steps"  # folder of the steps, in that of the run
 
 
 @contextmanager

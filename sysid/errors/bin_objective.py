@@ -40,14 +40,12 @@ class FeatureObjective:
     replay: Replays
     space: Space
     trials: tuple[Trial, ...]
-    track: float
-    """Of the vehicle [m]; shows how hard its wheels are pulled."""
+    track: float  # of the vehicle [m]; shows how hard its wheels are pulled
     features: Features
     target: np.ndarray  # (B, K, C) measured features
     mask: np.ndarray  # (B, K, C) weights of the bins
     whitener: Whitener
-    prior: Prior | None = None
-    """Its P residuals are the last ones of the first trial."""
+    prior: Prior | None = None  # its P residuals are the last ones of the first trial
 
     @property
     def enough(self) -> bool:

@@ -22,15 +22,12 @@ CHANNELS = ("odometry.v", "odometry.omega", "pose.forward", "pose.left", "pose.y
 Without the pose that the odometry adds up: its updates come in steps of its own clock, and fits with it foretold
 held-out drives worse (docs/fit.md).
 """
-GYRO = "gyro.omega"
-"""Mean yaw rate of a gyro in a bin [rad/s]: a channel where a log has one."""
+GYRO = "gyro.omega"  # mean yaw rate of a gyro in a bin [rad/s]: a channel where a log has one
 MAX_GAP = 0.6  # of a bin: a longer gap between samples leaves the bins it touches unmeasured
 LONG_AGO = -1e6  # s
 MAX_WIDE_GAP = 1.0  # the same of wider bins, where the outside pose comes seldom anyway
-WIDER = (2.0, 4.0)
-"""How many times wider bins may be where an outside pose comes too seldom for them."""
-ENOUGH = 0.7
-"""Least share of the bins between its first and last sample that an outside pose must measure."""
+WIDER = (2.0, 4.0)  # how many times wider bins may be where an outside pose comes too seldom for them
+ENOUGH = 0.7  # least share of the bins between its first and last sample that an outside pose must measure
 
 
 @dataclass(frozen=True)
@@ -60,8 +57,7 @@ class Features:
     start: np.ndarray  # (B, 3) pose at t = 0, the sample before the first one where it is a measurement
     mask: np.ndarray  # (B, K, C) 1 where measured
     middle: np.ndarray  # (K,) time of each bin's middle [s]
-    gyro: _Edges | None = None
-    """None where no gyro is a channel."""
+    gyro: _Edges | None = None  # none where no gyro is a channel
 
     def of(self, values: Measured | Simulated) -> np.ndarray:
         """Features (..., B, K, C); what was not measured is 0."""

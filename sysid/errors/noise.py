@@ -17,8 +17,7 @@ from sysid.replay.arrays import added, namespace
 
 ORDER = 4  # bins of memory of the filter
 RIDGE = 2e-3  # of the regression, as a share of its data
-USUAL = (0.01, 0.02, 0.02, 0.02, 0.03, 0.01)
-"""Noise of the features where there are no replicates [m/s, rad/s]."""
+USUAL = (0.01, 0.02, 0.02, 0.02, 0.03, 0.01)  # noise of the features where there are no replicates [m/s, rad/s]
 BIN_SHIFT = 0.05  # s that the commands of two drives may be apart while their bins still correspond
 FLOOR = 0.02  # least innovation of a channel, as a share of its standard deviation
 
@@ -73,8 +72,7 @@ def fit_whitener(series: np.ndarray, mask: np.ndarray, order: int = ORDER) -> Wh
     return Whitener(scale, coefficients, np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
-ROUGH = (0.1, 0.5, 1.5)
-"""Accelerations [m/s^2] between which a bin counts as ever rougher."""
+ROUGH = (0.1, 0.5, 1.5)  # accelerations [m/s^2] between which a bin counts as ever rougher
 
 
 def roughness(simulated: np.ndarray, width: float, track: float) -> np.ndarray:

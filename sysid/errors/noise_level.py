@@ -31,8 +31,7 @@ class NoisyDrives:
 
     series: np.ndarray  # (B, K, C)
     weight: np.ndarray  # (B, K, C) that makes the noise of all bins alike; 0 where nothing was measured
-    replicates: Sequence[Sequence[int]]
-    """Trials that repeat one another on the same day."""
+    replicates: Sequence[Sequence[int]]  # trials that repeat one another on the same day
     steady: np.ndarray  # (B, K) bool
 
 
@@ -42,10 +41,8 @@ class NoiseLevels:
 
     channels: tuple[str, ...]
     factor: np.ndarray  # (C,) nan where one of the two was not measured
-    error: float
-    """Standard error of the factors' logarithms."""
-    freedom: float
-    """Degrees of freedom of that error."""
+    error: float  # standard error of the factors' logarithms
+    freedom: float  # degrees of freedom of that error
     changed: np.ndarray  # (C,) bool: surely another than on the reference days
 
     @property
@@ -135,8 +132,7 @@ class _Size:
     """Noise of some drives."""
 
     log: np.ndarray  # (C,) logarithm of its size, up to a constant; nan where not measured
-    error: float
-    """Standard error of all channels together: a few parts show it of one badly."""
+    error: float  # standard error of all channels together: a few parts show it of one badly
     parts: int
 
 

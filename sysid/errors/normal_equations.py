@@ -23,8 +23,7 @@ from sysid.replay.records import Simulated
 DRIVES = 32768
 """Drives replayed by one call, as near as sets allow: an accelerator takes as long for a few (an H100 0.30 s for 2,000,
 0.33 s for these), and each number is compiled once."""
-STATES = 2**27
-"""States recorded by one call at most: 5 GB, several times as much with what is made of them."""
+STATES = 2**27  # states recorded by one call at most: 5 GB, several times as much with what is made of them
 SEARCHES, FEW = 32, 8
 """Sets whose gradients and Hessians are made together: as many at least as a search has starts, and so few where no
 more of them go on, or where it has a single one."""

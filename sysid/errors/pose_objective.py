@@ -41,8 +41,7 @@ class Noise:
     pose: np.ndarray  # (3,)
     odometry: np.ndarray  # (5,)
     source: str  # "replicates", "defaults" or "residuals"
-    gyro: float | None = None
-    """Of a gyro's mean rate between two samples [rad/s]; None where no trial has one."""
+    gyro: float | None = None  # of a gyro's mean rate between two samples [rad/s]; None where no trial has one
 
     def as_dict(self) -> dict[str, float]:
         names = ["ground_truth.x", "ground_truth.y", "ground_truth.yaw",
@@ -100,8 +99,7 @@ class Objective:
     trials: tuple[Trial, ...]
     measured: Measured
     noise: Noise
-    prior: Prior | None = None
-    """Its P residuals are the last ones of the first trial."""
+    prior: Prior | None = None  # its P residuals are the last ones of the first trial
 
     @property
     def counted(self) -> int:

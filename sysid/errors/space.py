@@ -14,8 +14,7 @@ import numpy as np
 from sysid.replay.arrays import namespace
 from whill_mjx.vehicle.specs import VehicleSpec
 
-STEP = 0.01
-"""Half the distance between the two ends of a difference, as a share of the parameter's range."""
+STEP = 0.01  # half the distance between the two ends of a difference, as a share of the parameter's range
 
 LOG_SPAN = 10.0
 # Parameters that no driving log determines, or that only act through another one; they keep their value unless named.
@@ -28,8 +27,7 @@ FIXED = {
 }
 NUISANCE = {
     "torque_drive.period": "this log cannot determine it; it is free so that it does not bias the others",
-}
-"""Searched, but never reported as determined: what its curvature at one point says holds nowhere else."""
+}  # searched, but never reported as determined: what its curvature at one point says holds nowhere else
 BENT = ("body.com_z",)
 """A log determines them better or worse by their own value: the load that driving shifts goes with the height."""
 LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns show how high the mass lies
@@ -47,12 +45,9 @@ PER_INERTIA = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "torq
 class Turned:
     """What one side's motor turns, from the nominal vehicle."""
 
-    mass: float
-    """Inertia of half of the vehicle, at the wheel [kg m^2]."""
-    wheel: float
-    """Nominal spin inertia of the wheels of one side [kg m^2]."""
-    yaw: float
-    """By how many times a wheel's spin inertia the vehicle is harder to turn about its vertical axis [-]."""
+    mass: float  # inertia of half of the vehicle, at the wheel [kg m^2]
+    wheel: float  # nominal spin inertia of the wheels of one side [kg m^2]
+    yaw: float  # by how many times a wheel's spin inertia the vehicle is harder to turn about its vertical axis [-]
     driven: float
     """Where the driven wheels are in the chassis frame [m]: centrifugal force shows how far before them the mass is."""
 
@@ -77,10 +72,8 @@ class Space:
     high: np.ndarray  # (P,)
     initial: np.ndarray  # (P,)
     log: np.ndarray  # (P,) bool
-    fixed: tuple[tuple[str, str], ...] = ()
-    """Names that keep their value, each with the reason."""
-    turned: Turned | None = None
-    """Of the vehicle, where it is one."""
+    fixed: tuple[tuple[str, str], ...] = ()  # names that keep their value, each with the reason
+    turned: Turned | None = None  # of the vehicle, where it is one
 
     def __post_init__(self) -> None:
         for name, low, high, value in zip(self.names, self.low, self.high, self.initial, strict=True):

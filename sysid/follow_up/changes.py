@@ -10,12 +10,10 @@ import numpy as np
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.logs.records import Prediction, Trial
 
-BLOCK = 2.0
-"""Length of the blocks that are drawn within a trial [s]: longer than what errors of speed remember."""
+BLOCK = 2.0  # length of the blocks that are drawn within a trial [s]: longer than what errors of speed remember
 RESAMPLES = 1000
 
-Squares = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]
-"""channel -> metric -> times (T,) and squared errors (T,)."""
+Squares = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]  # channel -> metric -> times (T,) and squared errors (T,)
 
 
 def squared_errors(trial: Trial, prediction: Prediction) -> Squares:

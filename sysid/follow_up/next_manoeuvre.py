@@ -35,15 +35,12 @@ from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL
 
 FILE = "next_command.csv"
-TIE = 0.2
-"""A refit whose gain falls short of the best one's by less than this share is a rival."""
+TIE = 0.2  # A refit whose gain falls short of the best one's by less than this share is a rival
 LEAST, ENOUGH = 3.0, 5.0
 """Standard deviations from which a drive counts as telling two effects apart, and that repetitions should reach."""
 MOST_REPEATS = 9
-SIZES = (1.0, 0.5, 0.2)
-"""Shares of the log's largest speed and yaw rate that every manoeuvre is tried at."""
-HEADINGS = (0.0, 90.0, 180.0, 270.0)
-"""Start headings [degrees] that are tried where a rival is fixed in the room."""
+SIZES = (1.0, 0.5, 0.2)  # shares of the log's largest speed and yaw rate that every manoeuvre is tried at
+HEADINGS = (0.0, 90.0, 180.0, 270.0)  # start headings [degrees] that are tried where a rival is fixed in the room
 FRACTIONS = (1.0, 0.75, 0.5, 0.35, 0.2)  # of the time in motion, where the room is too small
 REFINED = 24  # drives for which the absorbed part is computed as well
 POLISH = 3  # iterations of the refit of a rival that the search has not refitted
@@ -54,16 +51,11 @@ class PlannedDrive:
     """One drive of the library: a manoeuvre and how it is driven."""
 
     manoeuvre: str
-    v: float
-    """Speed [m/s]."""
-    omega: float
-    """Yaw rate [rad/s]."""
-    seconds: float
-    """Time in motion [s]."""
-    start: tuple[float, float, float]
-    """x, y [m] and heading [rad] in the room."""
-    dt: float = 0.1
-    """Command period [s]."""
+    v: float  # speed [m/s]
+    omega: float  # yaw rate [rad/s]
+    seconds: float  # time in motion [s]
+    start: tuple[float, float, float]  # x, y [m] and heading [rad] in the room
+    dt: float = 0.1  # command period [s]
 
     @property
     def command(self) -> Command:

@@ -32,12 +32,10 @@ DRAWS = 200
 SEED = 3  # beside that of the scan's nulls
 POWER = 0.8
 REACH, HALVINGS = 8.0, 7  # range of factors around a first guess, and how often it is halved
-FACTORS = (0.25, 0.5, 1.0, 2.0)
-"""Sizes of a named effect, over the fitted one, whose power is reported."""
+FACTORS = (0.25, 0.5, 1.0, 2.0)  # sizes of a named effect, over the fitted one, whose power is reported
 
 
-Effect = tuple[Columns, np.ndarray]
-"""Columns of a hypothesis and its coordinates (k,)."""
+Effect = tuple[Columns, np.ndarray]  # columns of a hypothesis and its coordinates (k,)
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,7 @@ class Days:
     evidence: Evidence
     hypotheses: Sequence[Hypothesis]
     wander: Wander
-    scan: Scan
-    """That was run on this evidence."""
+    scan: Scan  # that was run on this evidence
     nulls: NullDays
 
     def p(self, effects: Sequence[Effect] = ()) -> np.ndarray:
@@ -103,8 +100,7 @@ def smallest(days: Days, alpha: float, effects: Sequence[Effect]) -> list[tuple[
     return [(float(factor), float(share)) for factor, share in zip(high, power, strict=True)]
 
 
-FILE = Path(__file__).parents[1] / "data/null_p.json"
-"""The shape of the distribution, and the logs that it rests on."""
+FILE = Path(__file__).parents[1] / "data/null_p.json"  # the shape of the distribution, and the logs that it rests on
 
 
 def calibrated(p: float) -> float:

@@ -12,12 +12,9 @@ from sysid.verdict.agreement import with_prior
 from sysid.verdict.result import Result
 
 CONFIDENCE = 0.95
-FOLLOWED = 0.9
-"""Largest share of a direction's information in one manoeuvre with which its residual is enlarged."""
-NEARLY = 0.9
-"""Share of the largest size that is looked for from which a size is at its end."""
-MOVED = 0.01
-"""p-value of how far base parameters went, below which they went further than from day to day."""
+FOLLOWED = 0.9  # largest share of a direction's information in one manoeuvre with which its residual is enlarged
+NEARLY = 0.9  # share of the largest size that is looked for from which a size is at its end
+MOVED = 0.01  # p-value of how far base parameters went, below which they went further than from day to day
 LAW = ("speed", "yaw rate", "size of the step")
 """Quantities by which effects that act at the same times have different laws."""
 UNDONE = 0.5

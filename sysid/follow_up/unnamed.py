@@ -43,18 +43,15 @@ from whill_mjx.effects.unnamed import KNOTS, MAP, PERIODIC, QUANTITIES
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.types import VehicleParams
 
-KINDS = ("push", "brake")
-"""A wrench whatever the motion, or one that turns with its direction."""
+KINDS = ("push", "brake")  # A wrench whatever the motion, or one that turns with its direction
 ROOM = ("heading in the room", "x in the room", "y in the room", MAP)
 """Quantities that only an outside pose shows; replicates, which start elsewhere, differ in them."""
 REST_RANGE = {"time since rest": 4.0, "distance since rest": 0.6}
 FINALISTS = 3  # tables that are fitted to all trials, not to one of each manoeuvre alone
-LEAST = 0.1
-"""Least share of the excess residual that a table must predict on held-back manoeuvres."""
+LEAST = 0.1  # least share of the excess residual that a table must predict on held-back manoeuvres
 LEAST_GAIN = 25.0
 """Least lowering of their squared white residual: the best of all tables reached 16 in eight draws of noise."""
-COMPACT = 0.75
-"""Share of the table's held-back gain that few terms must reach to stand for it."""
+COMPACT = 0.75  # share of the table's held-back gain that few terms must reach to stand for it
 CHOICES = tuple(Try(1.0, share) for share in (1.0, 0.5, 0.2))
 ROUNDS = 3  # Gauss-Newton steps
 
@@ -77,20 +74,13 @@ class Unnamed:
 
     table: WrenchTable
     wrench: np.ndarray  # (2 KNOTS,) forces [N], then torques [N m]
-    terms: tuple[Term, ...]
-    """The sum that stands for the tables; none where no compact one does."""
-    coefficients: tuple[np.ndarray, ...]
-    """Of each term, for force [N] and torque [N m]."""
-    vehicle: VehicleParams
-    """The base model refitted beside it, with the effect."""
-    gain: float
-    """Share of the excess residual that it predicts on held-back manoeuvres (of the training trials)."""
-    by_manoeuvre: dict[str, float]
-    """Lowering of the squared white residual of each manoeuvre, held back."""
-    cost: tuple[float, float]
-    """Squared white residual of the training trials per sample, replayed before and after."""
-    tried: tuple[tuple[str, str, float], ...]
-    """Quantity, kind and held-back gain of every table that was fitted."""
+    terms: tuple[Term, ...]  # the sum that stands for the tables; none where no compact one does
+    coefficients: tuple[np.ndarray, ...]  # of each term, for force [N] and torque [N m]
+    vehicle: VehicleParams  # the base model refitted beside it, with the effect
+    gain: float  # share of the excess residual that it predicts on held-back manoeuvres (of the training trials)
+    by_manoeuvre: dict[str, float]  # lowering of the squared white residual of each manoeuvre, held back
+    cost: tuple[float, float]  # squared white residual of the training trials per sample, replayed before and after
+    tried: tuple[tuple[str, str, float], ...]  # quantity, kind and held-back gain of every table that was fitted
     angles: np.ndarray  # (B,) rad, of the wheels at the start of each trial
     kept: bool
 

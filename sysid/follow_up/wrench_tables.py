@@ -21,10 +21,8 @@ HARMONICS = 3
 class Term:
     """One term: its columns go into a sum together or not at all."""
 
-    form: str
-    """power, harmonic, sign, decay or log."""
-    number: float
-    """Exponent, harmonic, or the size over which it acts."""
+    form: str  # power, harmonic, sign, decay or log
+    number: float  # exponent, harmonic, or the size over which it acts
 
     def of(self, z: np.ndarray) -> np.ndarray:
         """Values (K, c) at z (K,)."""

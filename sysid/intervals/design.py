@@ -18,8 +18,7 @@ from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 
-INFLATION = 13.7
-"""Samples that count as one: an AR(1) residual of 0.9 at 20 Hz makes z-values 3.7 times too large."""
+INFLATION = 13.7  # samples that count as one: an AR(1) residual of 0.9 at 20 Hz makes z-values 3.7 times too large
 QUANTILE = 1.645  # of a 90 % interval
 DEFAULT = Noise(DEFAULT_NOISE["ground_truth"] / 4, DEFAULT_NOISE["odometry"] / 4, "defaults")
 Criterion = Literal["a", "d"]
@@ -32,10 +31,8 @@ class Plan:
     candidate: Candidate
     deviation: np.ndarray
     """(P,) standard deviations after the drive, in unit coordinates; those of the bounds where nothing is known."""
-    trace: float
-    """Sum of variances over the identifiable subspace, relative to that before the drive."""
-    volume: float
-    """Logarithm of the ratio of volumes after and before: -0.69 per halved standard deviation."""
+    trace: float  # sum of variances over the identifiable subspace, relative to that before the drive
+    volume: float  # logarithm of the ratio of volumes after and before: -0.69 per halved standard deviation
     information: np.ndarray  # (P, P) in unit coordinates
     path: np.ndarray  # (T, 2) m, simulated, from the start pose
     start: tuple[float, float, float]
@@ -131,8 +128,7 @@ class Subject:
 
     spec: VehicleSpec
     params: Any
-    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """90 % intervals by parameter name."""
+    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)  # 90 % intervals by parameter name
     noise: Noise = DEFAULT
 
 
@@ -141,11 +137,9 @@ class Proposal:
     """Manoeuvres to drive next, and why."""
 
     chosen: list[Plan]
-    plans: list[Plan]
-    """All plans for the first choice, best first."""
+    plans: list[Plan]  # all plans for the first choice, best first
     space: Space
-    before: np.ndarray
-    """(P,) deviations before the drives, in unit coordinates."""
+    before: np.ndarray  # (P,) deviations before the drives, in unit coordinates
 
 
 def propose(

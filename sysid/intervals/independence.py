@@ -23,8 +23,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-LEAST_LEFT = 1e-3
-"""Of a direction of which a block keeps less than this share of its errors, its residual says nothing."""
+LEAST_LEFT = 1e-3  # of a direction of which a block keeps less than this share of its errors, its residual says nothing
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ def sandwich(blocks: np.ndarray, inverse: np.ndarray) -> Sandwich:
 CONFIDENCE = 0.90
 ENOUGH = 2.0
 """Degrees of freedom from which the variance between blocks is taken: three or four drives that inform of one."""
-CHANCE = 0.05
-"""Probability below which what replicates share is taken for the model's error."""
+CHANCE = 0.05  # probability below which what replicates share is taken for the model's error
 FLIPS, AT_ONCE = 999, 2**22  # draws of the signs of blocks; numbers that are drawn together
 
 
@@ -81,13 +79,10 @@ class Information:
     scores: np.ndarray  # (B, K, P) J^T r of pieces of trials
     blocks: np.ndarray  # (B, K, P, P) J^T J of them
     groups: np.ndarray  # (B,) number of the manoeuvre that each trial is a replicate of
-    alike: float
-    """How probable residuals of replicates that are so much alike are, were they independent."""
-    variance: float
-    """Of residuals."""
+    alike: float  # how probable residuals of replicates that are so much alike are, were they independent
+    variance: float  # of residuals
     precision: np.ndarray  # (P, P) of what is known besides
-    share: float
-    """Variance that the precision is stated for."""
+    share: float  # variance that the precision is stated for
     ahead: np.ndarray = field(default_factory=lambda: np.ones((2, 1)))
     """(2, P) how many times as wide the intervals would be from their lower and upper ends."""
 

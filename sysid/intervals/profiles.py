@@ -22,8 +22,7 @@ from sysid.search.result import Progress
 POINTS = 9
 ITERATIONS = 4
 BETTER = 0.02  # of the threshold by which another point must be better to be reported
-REACH = 2.0
-"""How far the grid reaches, in half-widths of the interval from curvature."""
+REACH = 2.0  # how far the grid reaches, in half-widths of the interval from curvature
 
 
 @dataclass(frozen=True)
@@ -34,13 +33,11 @@ class Profile:
     values: np.ndarray  # (G,) ascending
     cost: np.ndarray  # (G,) mean squared residual, the other parameters at their best
     statistic: np.ndarray  # (G,) 0 at the best; twice the loss of log likelihood
-    threshold: float
-    """Of the statistic at the confidence level."""
+    threshold: float  # of the statistic at the confidence level
     interval: tuple[float | None, float | None]
     """Where the statistic crosses the threshold; None where it does not within the grid."""
     others: np.ndarray  # (G, P) values of all parameters
-    fitted: float
-    """Value where the fit had ended."""
+    fitted: float  # value where the fit had ended
 
     def remark(self, space: Space) -> str:
         """Which ends of the interval are open, and whether the profile found a better point than the fit."""
@@ -65,8 +62,7 @@ class Minimum:
     u: np.ndarray  # (P,) unit coordinates
     known: Uncertainty
     """Intervals there, which set a grid's reach; a parameter that is not determined gets its whole range."""
-    robust: bool = False
-    """It is the minimum of the Huber loss."""
+    robust: bool = False  # it is the minimum of the Huber loss
 
 
 def profile(

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-EXACT_UP_TO = 12
-"""Pairs up to which all sign patterns are counted (4096 of them)."""
+EXACT_UP_TO = 12  # pairs up to which all sign patterns are counted (4096 of them)
 RESAMPLES = 20_000
 TIE = 1e-12  # relative difference of two sums that counts as none
 

@@ -24,18 +24,15 @@ from sysid.logs.metrics import replicate_groups
 from sysid.search import least_squares
 from sysid.search.slopes import average_slopes, likely, likely_by
 
-PIECES = 8
-"""That each trial is cut into."""
+PIECES = 8  # that each trial is cut into
 PASSES = 2  # of averaging slopes: over errors by differences, and by averaged slopes
-PRIOR_SD = UNKNOWN
-"""Standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)."""
+PRIOR_SD = UNKNOWN  # standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)
 UNIDENTIFIABLE = 0.5
 """Share of the prior's standard deviation above which a parameter counts as not determined by the log."""
 WALL = 1e-3  # distance to a bound, in unit coordinates, that counts as being on it
 FOLLOW = 2  # iterations of all others at the end of an interval
 NEAR = 0.25  # share of a half-width below which a bound is too near to look how wide the interval is from there
-WIDEST = 3.0
-"""Times a half-width at the fit that it may have at the end: an interval then reaches 3.2 of them."""
+WIDEST = 3.0  # times a half-width at the fit that it may have at the end: an interval then reaches 3.2 of them
 
 
 @dataclass(frozen=True)
@@ -45,12 +42,10 @@ class Estimate:
     name: str
     initial: float
     value: float
-    low: float
-    """Lower end of the confidence interval; that of the bounds where the log does not determine it."""
+    low: float  # lower end of the confidence interval; that of the bounds where the log does not determine it
     high: float
     identifiable: bool
-    remark: str
-    """Why it is not identifiable, or on which bound it lies; empty otherwise."""
+    remark: str  # why it is not identifiable, or on which bound it lies; empty otherwise
 
 
 @dataclass(frozen=True)

@@ -60,12 +60,9 @@ QUANTITY_WORDS = {
 }
 TICKS = re.compile(r"tick|count|enc(oder)?s?([ _]|$)", re.IGNORECASE)
 """In the names of wheel angles that an encoder counts."""
-PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")
-"""A unit of ticks: so many in a turn."""
-COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)
-"""In the names of columns that count rows."""
-PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")
-"""A unit of rows: so many in a second."""
+PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")  # A unit of ticks: so many in a turn
+COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)  # in the names of columns that count rows
+PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")  # A unit of rows: so many in a second
 SIDES = {"left": {"left", "l", "lw", "wl", "vl", "lft", "fl", "rl", "bl", "lf", "lb", "links", "linkes"},
          "right": {"right", "r", "rw", "wr", "vr", "rgt", "fr", "rr", "br", "rf", "rb", "rechts", "rechtes"}}
 CORNERS = {"fl", "rl", "bl", "lf", "lb", "fr", "rr", "br", "rf", "rb"}
@@ -91,17 +88,13 @@ class Column:
     """What one column holds."""
 
     role: str
-    file: str
-    """Stem of the file."""
+    file: str  # stem of the file
     name: str
     unit: str
-    why: str
-    """How role and unit were found; empty where somebody said both."""
+    why: str  # how role and unit were found; empty where somebody said both
     sure: bool = True
-    assumed: bool = False
-    """Whether neither name nor numbers show the unit, so that it is the usual one."""
-    moves: bool = True
-    """Whether its numbers change by what a moving vehicle would have in this unit."""
+    assumed: bool = False  # whether neither name nor numbers show the unit, so that it is the usual one
+    moves: bool = True  # whether its numbers change by what a moving vehicle would have in this unit
 
     def __str__(self) -> str:
         return f"{self.role}={self.file}/{self.name}:{self.unit}"
@@ -113,10 +106,8 @@ class Table:
 
     stem: str
     columns: dict[str, np.ndarray]  # name -> (T,)
-    odd: Mapping[str, str] = field(default_factory=dict)
-    """Name of a column -> note on its cells that are no numbers."""
-    texts: Mapping[str, str] = field(default_factory=dict)
-    """Name of a column without numbers -> its first cell."""
+    odd: Mapping[str, str] = field(default_factory=dict)  # name of a column -> note on its cells that are no numbers
+    texts: Mapping[str, str] = field(default_factory=dict)  # name of a column without numbers -> its first cell
 
 
 def kind_of(role: str) -> str:

@@ -26,31 +26,23 @@ CONFIDENCE = 0.95
 class Stop:
     """A pause of the commands in which the vehicle stops though the last one was to move."""
 
-    begin: float
-    """s, of the last command."""
-    pause: float
-    """s until the next."""
-    falls: float
-    """s from the last command to half of the speed."""
+    begin: float  # s, of the last command
+    pause: float  # s until the next
+    falls: float  # s from the last command to half of the speed
 
 
 @dataclass(frozen=True)
 class Timeout:
     """The time-out of a base."""
 
-    value: float
-    """s after the last command."""
+    value: float  # s after the last command
     low: float
-    high: float
-    """95 % interval [s]."""
+    high: float  # 95 % interval [s]
     stops: int
-    trials: int
-    """In which it shows."""
-    first: str
-    """Of them the first."""
+    trials: int  # in which it shows
+    first: str  # of them the first
     at: float
-    pause: float
-    """s, of its first stop."""
+    pause: float  # s, of its first stop
 
 
 def command_timeout(trials: Sequence[Trial]) -> Timeout | None:

@@ -91,8 +91,7 @@ class ConvertConfig:
 
 
 OF_RECORDINGS = ("vehicle", "wheel_radius", "track", "mass", "command_topic", "odometry_topic", "truth_topic",
-                 "imu_topic", "input", "stamp", "split")
-"""Options that are for bags and tables."""
+                 "imu_topic", "input", "stamp", "split")  # options that are for bags and tables
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ LAGS = np.geomspace(0.05, 5.0, 40)  # s that are tried
 BLOCKS = 8
 LEAST_TURNED = 0.5  # rad/s, root of the summed squares of a quantity's signal below which a block says nothing
 NAME = "floor"
-MEMBER = 2.0
-"""Standard errors beyond which a quantity is a member of the change."""
+MEMBER = 2.0  # standard errors beyond which a quantity is a member of the change
 CONFIDENCE = 1.96
 
 
@@ -33,12 +32,9 @@ class Quantity:
 
     name: str
     unit: str
-    parameter: str
-    """Of the vehicle's model that says most nearly the same."""
-    effects: tuple[str, ...]
-    """Effects that these drives cannot separate in it."""
-    lag: bool = False
-    """Whether it is a time, whose logarithm is estimated."""
+    parameter: str  # of the vehicle's model that says most nearly the same
+    effects: tuple[str, ...]  # effects that these drives cannot separate in it
+    lag: bool = False  # whether it is a time, whose logarithm is estimated
 
 
 QUANTITIES = (
@@ -154,22 +150,17 @@ class Member:
     quantity: Quantity
     before: float
     after: float
-    interval: tuple[float, float]
-    """95 % of its value on these drives."""
-    away: float
-    """Difference over its standard error; of a time, of its logarithm."""
+    interval: tuple[float, float]  # 95 % of its value on these drives
+    away: float  # difference over its standard error; of a time, of its logarithm
 
 
 @dataclass(frozen=True)
 class FloorChange:
     """Whether these drives were driven on another floor than the reference days."""
 
-    members: tuple[Member, ...]
-    """What differs, furthest first; where the change is real, at least one."""
-    p: float
-    """Of drives on the same floor, family-wise over all quantities."""
-    tried: int
-    """How many those are."""
+    members: tuple[Member, ...]  # what differs, furthest first; where the change is real, at least one
+    p: float  # of drives on the same floor, family-wise over all quantities
+    tried: int  # how many those are
     named: bool
 
     @property

@@ -9,12 +9,10 @@ import numpy as np
 
 from sysid.logs.records import Trial
 
-SURE = 0.9
-"""Least correlation of both turns, of either sign, that settles the sign."""
+SURE = 0.9  # least correlation of both turns, of either sign, that settles the sign
 LARGEST = 1.25
 """Factor by which a gyro may turn more or less than what is seen otherwise: as far as `gyro_bias.scale` goes."""
-LEAST_TURN = 0.5
-"""Root of the summed squares of the turns [rad] below which nothing turned."""
+LEAST_TURN = 0.5  # root of the summed squares of the turns [rad] below which nothing turned
 
 
 def told_sign(turns: Sequence[tuple[float, float]]) -> float | None:

@@ -41,8 +41,7 @@ FEATURES = {
     "action": ("command", ("v [m/s]", "omega [rad/s]")),
     "observation.state": ("odometry", ("x [m]", "y [m]", "yaw [rad]", "v [m/s]", "omega [rad/s]")),
     "observation.ground_truth": ("ground_truth", ("x [m]", "y [m]", "yaw [rad]")),
-}
-"""Feature -> stream and names of its parts, as they are written."""
+}  # feature -> stream and names of its parts, as they are written
 WIDEST = 10_000  # numbers of a feature in a row
 NEEDED = "{what} needs the package pyarrow, for its parquet files. Install it: pip install 'whill-mjx[lerobot]'."
 AGAIN = "Record or download the dataset again."
@@ -52,12 +51,9 @@ AGAIN = "Record or download the dataset again."
 class Episodes:
     """The drives of a LeRobotDataset."""
 
-    drives: list[tuple[str, Table]]
-    """Name and columns of each, named FEATURE/PART."""
-    held_out: tuple[str, ...]
-    """Episodes of another split than train."""
-    spec: VehicleSpec | None
-    """Nominal geometry, where `write` noted it."""
+    drives: list[tuple[str, Table]]  # name and columns of each, named FEATURE/PART
+    held_out: tuple[str, ...]  # episodes of another split than train
+    spec: VehicleSpec | None  # nominal geometry, where `write` noted it
     notes: tuple[str, ...]
 
 

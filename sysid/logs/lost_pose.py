@@ -14,12 +14,10 @@ import numpy as np
 from sysid.logs.records import Log, Trial
 from sysid.logs.streams import added_up
 
-LOST = 0.5
-"""Yaw [rad] by which the outside pose may part from the rate: at 3 m/s it is off by 1.5 m a second later."""
+LOST = 0.5  # yaw [rad] by which the outside pose may part from the rate: at 3 m/s it is off by 1.5 m a second later
 LATEST, STEP = 1.2, 0.05  # s, delays of the outside pose that are tried
 FACTOR = 0.15  # by which the rate's scale may be off
-LEAST = 8
-"""Training trials that must be left for lost ones to be left out."""
+LEAST = 8  # training trials that must be left for lost ones to be left out
 
 
 def yaw_contradiction(trial: Trial, rate: tuple[np.ndarray, np.ndarray]) -> float:

@@ -52,13 +52,10 @@ CONVERT = "Convert the original again"
 ORIGINAL = "Use the original file."
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
 MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
-FRAME_SAMPLES = 5
-"""Samples whose mean yaw the converter of the DRIVE windows took for the frame of their positions."""
+FRAME_SAMPLES = 5  # samples whose mean yaw the converter of the DRIVE windows took for the frame of their positions
 RARE = 0.5  # of an update, by which intervals that a run does not show are counted
-BREAK = 0.5
-"""Probability of a lost update from which the motion over a joint is not compared bin by bin."""
-HELD = 1e-9
-"""Difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample."""
+BREAK = 0.5  # probability of a lost update from which the motion over a joint is not compared bin by bin
+HELD = 1e-9  # difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample
 ROBOTS = ("robot1", "robot2", "robot3", "robot4", "robot5")
 MRCLAM_WINDOW = 15.0  # s
 MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated

@@ -31,8 +31,7 @@ CURES = {
     "no straight motion": "straight", "no turn": "arcs", "turns to one side only": "square", "no reversal": "reversal",
     "one speed": "step_ladder", "steps of hardly any different size": "step_ladder",
     "no slow crossing of zero": "slow_sine", "one heading of the room": "square",
-}
-"""Cause of a blind spot -> manoeuvre that removes it, in order of what it hides."""
+}  # cause of a blind spot -> manoeuvre that removes it, in order of what it hides
 OTHERS = ("random_steps", "figure_eight", "stop_and_go", "circle", "turn_ladder")
 """What is driven where nothing is missing: manoeuvres that the log does not have yet come first."""
 
@@ -44,10 +43,8 @@ class NextDrive:
     name: str
     why: str
     command: Command
-    floor: tuple[float, float]
-    """Free floor that it needs [m], along its first heading and across it, margins included."""
-    radius: float
-    """Of the vehicle around its drive-axle centre [m], as the floor was reckoned."""
+    floor: tuple[float, float]  # free floor that it needs [m], along its first heading and across it, margins included
+    radius: float  # of the vehicle around its drive-axle centre [m], as the floor was reckoned
 
 
 def next_drives(

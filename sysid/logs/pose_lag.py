@@ -21,23 +21,19 @@ GRID = np.linspace(0.0, 1.0, 41)  # s
 FLIPS = 20000
 TINY = 1e-12
 
-Rates = Mapping[str, tuple[np.ndarray, np.ndarray]]
-"""Trial -> times (T,) [s] and yaw rates (T,) [rad/s] of the body."""
+Rates = Mapping[str, tuple[np.ndarray, np.ndarray]]  # trial -> times (T,) [s] and yaw rates (T,) [rad/s] of the body
 
 
 @dataclass(frozen=True)
 class PoseLag:
     """A delay of the outside pose."""
 
-    delay: float
-    """Of all drives [s]."""
+    delay: float  # of all drives [s]
     low: float
-    high: float
-    """95 % interval of it, from blocks left out in turn [s]."""
+    high: float  # 95 % interval of it, from blocks left out in turn [s]
     p: float
     """Probability of so much better a prediction of held-back blocks if the delay meant nothing: signs of blocks."""
-    share: float
-    """Share of the held-back error that it removes."""
+    share: float  # share of the held-back error that it removes
 
 
 def pose_lag(trials: Sequence[Trial], blocks: Sequence[Sequence[int]], rates: Rates | None = None) -> PoseLag | None:

@@ -59,12 +59,10 @@ class TextDrive:
     """One drive out of text files."""
 
     name: str
-    tables: dict[str, np.ndarray]
-    """"command", "odometry", "ground_truth": t [s] and the columns of docs/log_format.md."""
+    tables: dict[str, np.ndarray]  # "command", "odometry", "ground_truth": t [s] and the columns of docs/log_format.md
     columns: tuple[Column, ...]
     notes: tuple[str, ...]
-    measured_input: bool
-    """Whether the commands are measured wheel speeds."""
+    measured_input: bool  # whether the commands are measured wheel speeds
 
 
 def text_files(source: Path) -> list[list[Path]]:

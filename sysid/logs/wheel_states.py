@@ -22,8 +22,7 @@ int32 power_on
 int32 speed_mode_indicator
 int32 error
 """
-JOYSTICK_FIELDS = "int8 joy_front\nint8 joy_side\n"
-"""That newer drivers add."""
+JOYSTICK_FIELDS = "int8 joy_front\nint8 joy_side\n"  # that newer drivers add
 KMH = 1 / 3.6  # m/s
 COARSE = 0.15  # s between states, above which speeds are too coarse to identify a drive from
 

@@ -16,8 +16,7 @@ from sysid.logs.replicates import same_course
 
 WINDOW = 20.0
 """Greatest length of a window [s]: long for a vehicle's delays, lags and turns, short for the drift of a replay."""
-LONG = 6 * WINDOW
-"""Length from which a drive is cut [s]."""
+LONG = 6 * WINDOW  # length from which a drive is cut [s]
 AROUND = 0.25
 """Time before and after a window's start [s] over which its speeds, and its pose from outside, are taken as a line."""
 TINY = 1e-9

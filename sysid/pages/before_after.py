@@ -30,8 +30,7 @@ class Paths:
     channel: str
     t: np.ndarray  # (T,) s
     measured: np.ndarray  # (T, 3)
-    replays: dict[str, np.ndarray]
-    """Replay -> (T, 3)."""
+    replays: dict[str, np.ndarray]  # replay -> (T, 3)
 
 
 def replayed_paths(trials: Sequence[Trial], replays: Mapping[str, Sequence[Prediction]]) -> list[Paths]:

@@ -39,8 +39,7 @@ class Loaded:
 
     log: Log
     path: str | Path
-    source: dict[str, Any] = field(default_factory=dict)
-    """More to note beside it."""
+    source: dict[str, Any] = field(default_factory=dict)  # more to note beside it
 
 
 def make_report(data: Loaded, config: FitConfig, fit: Fit, rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -102,10 +102,8 @@ def trials(found: dict[str, Any]) -> str:
 COLOURS = {"command": "tab:gray", "odometry": "tab:blue", "ground_truth": "tab:red"}
 LABELS = {"command": "command", "odometry": "odometry", "ground_truth": "outside pose"}
 
-UNITS = {"m": ("x", "y"), "rad": ("yaw",), "m/s": ("v",), "rad/s": ("omega",)}
-"""Quantities of each unit."""
-MARKS = ("o", "x")
-"""Marks of the quantities of one unit."""
+UNITS = {"m": ("x", "y"), "rad": ("yaw",), "m/s": ("v",), "rad/s": ("omega",)}  # quantities of each unit
+MARKS = ("o", "x")  # marks of the quantities of one unit
 
 
 def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:

@@ -30,8 +30,7 @@ METRIC_WORDS = {"trajectory": "position", "yaw": "heading", "velocity": "speed",
 PART_WORDS = {"held_out": "Drives that no fit has seen", "training": "Drives that were fitted"}
 CHANNEL_WORDS = {"ground_truth": "outside pose", "odometry": "odometry"}
 SHOWN_UNITS = {"m": ("cm", 100.0), "rad": ("degrees", 180 / np.pi), "m/s": ("cm/s", 100.0),
-               "rad/s": ("degrees/s", 180 / np.pi)}
-"""Unit of a metric -> the one that is shown, and its factor."""
+               "rad/s": ("degrees/s", 180 / np.pi)}  # unit of a metric -> the one that is shown, and its factor
 
 
 def write_page(out: Path, report: dict[str, Any]) -> Path:

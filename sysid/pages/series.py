@@ -30,8 +30,7 @@ class Channel:
     """One channel of one trial."""
 
     t: np.ndarray  # (T,) s
-    values: dict[str, np.ndarray]
-    """"measured", "ideal", "initial", "fitted" -> (T, 3) or (T, 5)."""
+    values: dict[str, np.ndarray]  # "measured", "ideal", "initial", "fitted" -> (T, 3) or (T, 5)
 
     def error(self, replay: str = "fitted") -> np.ndarray:
         """Replayed minus measured (T, C); position along and left of the measured heading, yaw as an angle."""
@@ -50,8 +49,7 @@ class TrialSeries:
 
     name: str
     held_out: bool
-    start: tuple[float, float, float]
-    """x, y [m], yaw [rad] in the room."""
+    start: tuple[float, float, float]  # x, y [m], yaw [rad] in the room
     channels: dict[str, Channel]
 
 

@@ -18,8 +18,7 @@ from whill_mjx.effects.pose_delay import PoseDelay
 from whill_mjx.effects.sensor_delay import SensorDelay
 from whill_mjx.vehicle.types import Motion
 
-LONG = 1e6
-"""A time after which every effect on commands has come to what it makes of a constant command [s]."""
+LONG = 1e6  # A time after which every effect on commands has come to what it makes of a constant command [s]
 
 
 def without(params: Any, name: str) -> tuple[Any, Any]:

@@ -27,8 +27,7 @@ from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams, parameters_of
 
-AROUND = ("command", "sensing", "outside")
-"""Places of effects that need to know nothing of what is inside a model."""
+AROUND = ("command", "sensing", "outside")  # places of effects that need to know nothing of what is inside a model
 Bounds = tuple[float, float, float] | tuple[float, float, float, str]
 """Initial value, lowest, highest, and, where it has one, the unit."""
 
@@ -37,10 +36,8 @@ Bounds = tuple[float, float, float] | tuple[float, float, float, str]
 class Parameters:
     """Parameters of a model that is not a vehicle file: what `VehicleParams` is to the simulator's vehicle."""
 
-    values: dict[str, jax.Array]
-    """() each, by name."""
-    effects: tuple = ()
-    """Effects around the model, of the places `AROUND`."""
+    values: dict[str, jax.Array]  # () each, by name
+    effects: tuple = ()  # effects around the model, of the places `AROUND`
     about: tuple[tuple[str, Parameter], ...] = struct.field(pytree_node=False, default=())
     """Unit, bounds and initial value (as `neutral`) of each of `values`."""
     room_fixed: bool = struct.field(pytree_node=False, default=False)
@@ -63,16 +60,12 @@ class Model:
     """A model that is fitted in place of the simulator's vehicle."""
 
     name: str
-    plant: Plant
-    """Its functions take `Parameters`."""
-    params: Parameters
-    """Where the search starts."""
+    plant: Plant  # its functions take `Parameters`
+    params: Parameters  # where the search starts
     write: Callable[[Path, Parameters], Path] | None = None
     """Writes the fitted model into a folder in its own format; returns the file."""
-    notes: tuple[str, ...] = ()
-    """What of its file was left out or replaced."""
-    around: tuple[str, ...] = ()
-    """Effects that it may have around it: a fit adds those that a log shows."""
+    notes: tuple[str, ...] = ()  # what of its file was left out or replaced
+    around: tuple[str, ...] = ()  # effects that it may have around it: a fit adds those that a log shows
     vehicle: Callable[[Parameters, VehicleSpec], Twin | str] | None = None
     """The vehicle of the simulator that drives alike, or why there is none."""
 
@@ -278,11 +271,9 @@ class Surrounded:
     """State of a model with what is around it."""
 
     inner: Any
-    memory: tuple
-    """Of the effects."""
+    memory: tuple  # of the effects
     encoder: Odometry
-    reading: Odometry
-    """The same after the effects of place `sensing`."""
+    reading: Odometry  # the same after the effects of place `sensing`
     diverged: jax.Array  # () bool
 
 

@@ -207,14 +207,10 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
 class Commanded(NamedTuple):
     """One drive that is to be replayed."""
 
-    command: jax.Array
-    """(R, K, 2) in force in each of K physics steps between records [m/s, rad/s]."""
-    start: jax.Array
-    """(5,) x, y, yaw, v, omega."""
-    warm_up: int = 0
-    """Physics steps at the start's speeds before it."""
-    speeds: jax.Array | None = None
-    """(W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`)."""
+    command: jax.Array  # (R, K, 2) in force in each of K physics steps between records [m/s, rad/s]
+    start: jax.Array  # (5,) x, y, yaw, v, omega
+    warm_up: int = 0  # physics steps at the start's speeds before it
+    speeds: jax.Array | None = None  # (W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`)
 
 
 def path_of(plant: Plant, params: Any, commanded: Commanded, few: bool = False, gyro: bool = False) -> jax.Array:

@@ -44,37 +44,27 @@ from whill_mjx.vehicle.specs import VehicleSpec
 class Fit:
     """A fitted vehicle and what is known of it."""
 
-    params: Any
-    """`VehicleParams` at the fitted values."""
+    params: Any  # `VehicleParams` at the fitted values
     initial_params: Any
     space: Space
     uncertainty: uncertainty.Uncertainty
     noise: Noise
-    scan: FitResult | None
-    """Result of the global search."""
-    coarse: FitResult | None
-    """Result of the search on features, of all its starts."""
-    search: FitResult | None
-    """Result of the gradient search."""
+    scan: FitResult | None  # result of the global search
+    coarse: FitResult | None  # result of the search on features, of all its starts
+    search: FitResult | None  # result of the gradient search
     u: np.ndarray  # (P,) fitted unit coordinates
     initial_cost: float
-    cost: float
-    """Mean squared white residual (large ones counted linearly); J in metres after a global search."""
+    cost: float  # mean squared white residual (large ones counted linearly); J in metres after a global search
     profiles: list[tuple[str, np.ndarray, np.ndarray]]
     seconds: float
     plant: Plant
-    prior: Prior | None = None
-    """Of an earlier vehicle file."""
-    model: Model | None = None
-    """What was fitted in place of the simulator's vehicle."""
-    likelihoods: tuple[Profile, ...] = ()
-    """Profile likelihoods of the parameters that `profile` names."""
+    prior: Prior | None = None  # of an earlier vehicle file
+    model: Model | None = None  # what was fitted in place of the simulator's vehicle
+    likelihoods: tuple[Profile, ...] = ()  # profile likelihoods of the parameters that `profile` names
     frame: float | None = None
     """Time between the frames of the odometry [s] (`sysid.logs.odometry_frames`), where they show."""
-    stated: tuple[str, ...] = ()
-    """Groups of sizes that keep their stated values (`sysid.search.stated`)."""
-    replay: Replays | None = None
-    """Of the training trials; what it has compiled serves other trials too."""
+    stated: tuple[str, ...] = ()  # groups of sizes that keep their stated values (`sysid.search.stated`)
+    replay: Replays | None = None  # of the training trials; what it has compiled serves other trials too
 
 
 def fit_log(
@@ -187,16 +177,12 @@ class Problem:
     """What a search is given."""
 
     plant: Plant
-    params: Any
-    """Where it starts."""
+    params: Any  # where it starts
     space: Space
-    objective: Objective
-    """Over the training trials."""
-    intervals: dict[str, tuple[float, float]]
-    """Of an earlier vehicle file."""
+    objective: Objective  # over the training trials
+    intervals: dict[str, tuple[float, float]]  # of an earlier vehicle file
     model: Model | None
-    frame: float | None = None
-    """Time between the frames of the odometry [s], which the trials' rows are at."""
+    frame: float | None = None  # time between the frames of the odometry [s], which the trials' rows are at
 
 
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:

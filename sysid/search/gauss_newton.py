@@ -32,20 +32,15 @@ class BoxStep:
 
     low: Any = 0.0  # (P,), or one for all
     high: Any = 1.0
-    reach: Any = 0.3
-    """Largest step, or a function that gives it (N, P) at u (N, P)."""
-    free: Any = True
-    """(P,) or (N, P): False for parameters that keep their value."""
+    reach: Any = 0.3  # largest step, or a function that gives it (N, P) at u (N, P)
+    free: Any = True  # (P,) or (N, P): False for parameters that keep their value
     move: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.add
     """Where a step (N, P) from u (N, P) leads (`Space.moved`)."""
     passes: int = 3
     """Solutions at most, each with more parameters held: cutting one at its wall may lead another to its own."""
-    adapt: bool = False
-    """Hold whatever is cut, by its reach too, at the cut step; otherwise only what begins at a wall."""
-    floor: float = 1e-6
-    """Damping of parameters that do nothing, as a share of the largest curvature."""
-    ridge: float = 0.0
-    """Share of the largest curvature that is added whatever the damping."""
+    adapt: bool = False  # hold whatever is cut, by its reach too, at the cut step; otherwise only what begins at a wall
+    floor: float = 1e-6  # damping of parameters that do nothing, as a share of the largest curvature
+    ridge: float = 0.0  # share of the largest curvature that is added whatever the damping
 
     def points(self, u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any) -> np.ndarray:
         """The points (N, P) to which steps from u (N, P) lead, with half gradients (N, P) and Hessians (N, P, P), or
@@ -85,30 +80,22 @@ class BoxStep:
 class Try(NamedTuple):
     """One of the points that are tried in a step."""
 
-    factor: float
-    """On the damping of the start."""
-    share: float = 1.0
-    """Of the step."""
-    easing: float | None = None
-    """Factor on the damping after the try was the best; None takes `factor`."""
+    factor: float  # on the damping of the start
+    share: float = 1.0  # of the step
+    easing: float | None = None  # factor on the damping after the try was the best; None takes `factor`
 
 
 @dataclass(frozen=True)
 class Patience:
     """When a start is at its minimum."""
 
-    tolerance: float
-    """A gain below this share of the cost is small."""
-    times: int = 1
-    """Small gains that end the search, and none in between of `anew` tolerances or more."""
+    tolerance: float  # A gain below this share of the cost is small
+    times: int = 1  # small gains that end the search, and none in between of `anew` tolerances or more
     anew: float = 1.0
-    noise: float = 0.0
-    """What no step takes away of the cost: gains are compared with the rest, or with `least`."""
+    noise: float = 0.0  # what no step takes away of the cost: gains are compared with the rest, or with `least`
     least: float = 0.0
-    failures: bool = False
-    """Whether a step that gains nothing counts as a small gain."""
-    first: int = 0
-    """Steps before a small gain counts."""
+    failures: bool = False  # whether a step that gains nothing counts as a small gain
+    first: int = 0  # steps before a small gain counts
 
     def scale(self, cost: np.ndarray) -> np.ndarray:
         """Gains below this are small."""
@@ -159,15 +146,11 @@ class GaussNewton:
     box: BoxStep
     choices: tuple[Try, ...]
     patience: Patience
-    prior: tuple[np.ndarray, np.ndarray] | None = None
-    """Mean m (P,) and precision L (P, P)."""
-    damping: float = 1e-2
-    """At first."""
+    prior: tuple[np.ndarray, np.ndarray] | None = None  # mean m (P,) and precision L (P, P)
+    damping: float = 1e-2  # at first
     least: float = 1e-7
-    most: float = 1e4
-    """A start is at its minimum when a step with this damping gains nothing."""
-    stiffer: float = 100.0
-    """Factor on the damping after a step that gained nothing."""
+    most: float = 1e4  # A start is at its minimum when a step with this damping gains nothing
+    stiffer: float = 100.0  # factor on the damping after a step that gained nothing
 
     def init(self, u: np.ndarray) -> State:
         """Starts u (S, P) whose cost is unknown."""

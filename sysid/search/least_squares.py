@@ -20,8 +20,7 @@ from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try
 from sysid.search.result import FitResult, Progress
 from whill_mjx.io.steps import step
 
-DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
-"""Factors on each start's damping that are tried in one iteration."""
+DAMPINGS = (0.1, 1.0, 10.0, 1000.0)  # factors on each start's damping that are tried in one iteration
 MANY_DAMPINGS = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
 """The same on an accelerator, where more tries take no longer, and a second call as long as the first."""
 GRID, APART = 6, 0.1  # points over a range, of which those so far away may lie in another valley
@@ -46,8 +45,7 @@ class Sums(Protocol):
 class Stopping:
     """When a search ends."""
 
-    iterations: int = 30
-    """At most."""
+    iterations: int = 30  # at most
     tolerance: float = 1e-4
     """A start has converged when its cost fell by less than this share twice, and not by GOES_ON times as much in
     between: where wheels skid or torques meet their limit, costs are jagged."""

@@ -19,14 +19,11 @@ from sysid.search.gauss_newton import BoxStep, normal_sums
 from sysid.search.result import FitResult, Progress
 from whill_mjx.io.steps import step
 
-ROTATIONS = 3
-"""Of the ellipsoid's axes, at random: each has points at both ends of all P axes."""
+ROTATIONS = 3  # of the ellipsoid's axes, at random: each has points at both ends of all P axes
 AT_ONCE = 2**23  # residuals, of points that are replayed together
 REFLECTIONS = 8  # passes over the walls of the box; what is outside still then is moved inwards
-REACH = 0.08
-"""Largest standard deviation of the points, in unit coordinates: further away lie other valleys."""
-EXACT = 1e-9
-"""Least cost, in squared noise scales: a model that fits to the last bit still has an ellipsoid."""
+REACH = 0.08  # largest standard deviation of the points, in unit coordinates: further away lie other valleys
+EXACT = 1e-9  # least cost, in squared noise scales: a model that fits to the last bit still has an ellipsoid
 ROUNDS, MISSES, WORTH = 24, 3, 2e-4
 """Maximum rounds of a descent; patience; the share of the cost that a round must gain unless squares fall by one."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round

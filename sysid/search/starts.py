@@ -23,12 +23,10 @@ SCAN = 256
 KEPT, FIRST = 8, 3
 """The best of them, and the iterations from each: two of eight lead to the deepest valley, and a few nearly show which.
 """
-FOLLOWED, STEPS = 2, 20
-"""How many of those are searched further, and in how many iterations at most."""
+FOLLOWED, STEPS = 2, 20  # how many of those are searched further, and in how many iterations at most
 EDGE = 0.02  # of the range, at both ends, without random points
 CHUNK = 512  # points whose residuals are kept at once
-AGREE = 0.02
-"""Starts agree where their costs differ by no more than this share of the best one."""
+AGREE = 0.02  # starts agree where their costs differ by no more than this share of the best one
 TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
 
 

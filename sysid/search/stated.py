@@ -35,16 +35,14 @@ GROUPS = {
 """What is measured in one way, and so known or unknown together."""
 DAMPING = 1e-3
 ITERATIONS = 15
-LARGEST = 1e30
-"""Error of a replay that diverged."""
+LARGEST = 1e30  # error of a replay that diverged
 
 
 @dataclass(frozen=True)
 class Choice:
     """Groups that keep their stated sizes, and where that leads."""
 
-    names: tuple[str, ...]
-    """Of `GROUPS`."""
+    names: tuple[str, ...]  # of `GROUPS`
     u: np.ndarray  # (P,)
     cost: float
 

@@ -27,14 +27,11 @@ BATCH = {"tpe": 4, "cmaes": 16}
 """Candidates that are simulated together: of TPE as many as a processor replays at no loss, of CMA-ES its population.
 """
 STARTUP = 32  # random candidates of TPE before it draws from those that it knows
-LEASE = 600.0
-"""Seconds after which a process on another machine that has not been heard of counts as dead."""
+LEASE = 600.0  # seconds after which a process on another machine that has not been heard of counts as dead
 POLL = 0.2  # s between looks while others finish
-UNNAMED = 10.0
-"""Seconds after which a candidate without a process's name on it was made by one that died in between."""
+UNNAMED = 10.0  # seconds after which a candidate without a process's name on it was made by one that died in between
 HIDDEN = "***"
-HOST = re.compile(r"(\[[^\]]*\]|[^:]*)(:\d*)?")
-"""Name or address of a server, and its port."""
+HOST = re.compile(r"(\[[^\]]*\]|[^:]*)(:\d*)?")  # name or address of a server, and its port
 SECRET_OPTION = re.compile(r"([?&;][^=&;]*(?:pass|secret|token|key|auth)[^=&;]*)=([^&;]*)", re.IGNORECASE)
 """An option of a URL whose value is not shown."""
 SIGMA = 0.2  # first standard deviation of CMA-ES, in unit coordinates
@@ -117,8 +114,7 @@ def _masked(message: str, storage: str) -> str:
 class StudyPlace:
     """Where a study is kept, and what it is about."""
 
-    storage: Any = None
-    """Of `open_storage`, or what it opens; None keeps the study in memory."""
+    storage: Any = None  # of `open_storage`, or what it opens; None keeps the study in memory
     name: str = "fit"
     problem: Mapping[str, str] = field(default_factory=dict)
     """What is searched, as short texts; a study of another problem is refused."""

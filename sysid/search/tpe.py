@@ -20,15 +20,11 @@ __all__ = ["fit"]
 class GlobalSearch:
     """How a global search goes."""
 
-    evaluations: int = 500
-    """Parameter sets to try; in a shared study, by all its processes together."""
+    evaluations: int = 500  # parameter sets to try; in a shared study, by all its processes together
     seed: int = 0
-    cost: str = "weighted"
-    """"weighted" (least squares over all channels) or "paper" (sum of position RMSE)."""
-    method: str = "tpe"
-    """"tpe" or "cmaes"."""
-    best: int = 4
-    """How many of the best candidates to return in `starts`."""
+    cost: str = "weighted"  # "weighted" (least squares over all channels) or "paper" (sum of position RMSE)
+    method: str = "tpe"  # "tpe" or "cmaes"
+    best: int = 4  # how many of the best candidates to return in `starts`
 
 
 def fit(
