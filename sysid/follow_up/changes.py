@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.metrics import METRICS, UNITS
+from sysid.logs.metrics import METRICS, UNITS, errors_of
 from sysid.logs.records import Prediction, Trial
 
 BLOCK = 2.0  # length of the blocks that are drawn within a trial [s]: longer than what errors of speed remember
@@ -18,21 +18,8 @@ Squares = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]  # channel -> metr
 
 def squared_errors(trial: Trial, prediction: Prediction) -> Squares:
     """The squares whose mean over a trial is the square of `sysid.logs.metrics.score`."""
-    out: Squares = {}
-    truth, simulated = trial.ground_truth, prediction.ground_truth
-    if truth is not None and simulated is not None:
-        out["ground_truth"] = {
-            "trajectory": (truth.t, np.square(simulated.x - truth.x) + np.square(simulated.y - truth.y)),
-            "yaw": (truth.t, np.square(simulated.yaw - truth.yaw))}
-    seen, replayed = trial.odometry, prediction.odometry
-    if seen is not None and replayed is not None:
-        mine = {"velocity": np.square(replayed.v - seen.v), "angular_velocity": np.square(replayed.omega - seen.omega)}
-        if seen.x is not None and seen.y is not None and seen.yaw is not None:
-            assert replayed.x is not None and replayed.y is not None and replayed.yaw is not None
-            mine["trajectory"] = np.square(replayed.x - seen.x) + np.square(replayed.y - seen.y)
-            mine["yaw"] = np.square(replayed.yaw - seen.yaw)
-        out["odometry"] = {metric: (seen.t, values) for metric, values in mine.items()}
-    return out
+    return {channel: {metric: (t, np.square(error)) for metric, (t, error) in mine.items()}
+            for channel, mine in errors_of(trial, prediction).items()}
 
 
 def by_manoeuvre(

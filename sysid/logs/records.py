@@ -87,11 +87,6 @@ class GyroStream:
         """(T, 1) of the turn."""
         return self.turn[:, None]
 
-    def until(self, end: float) -> GyroStream:
-        """The samples up to a time [s]."""
-        inside = self.t <= end
-        return GyroStream(self.t[inside], self.turn[inside])
-
 
 @dataclass(frozen=True)
 class Start:
