@@ -97,8 +97,7 @@ def steady_bins(trial: Trial, bins: int, width: float) -> np.ndarray:
 
 
 def said(levels: Mapping[str, Mapping[str, Any]], alone: bool) -> str:
-    """The channels that changed in a sentence without its full stop, "" where none did; `alone`: nothing else
-    changed."""
+    """The channels that changed in a sentence without its full stop, "" without any; `alone`: nothing else changed."""
     parts = []
     for name, one in levels.items():
         low, high = one["interval"]

@@ -119,8 +119,7 @@ class Objective:
 
     @cached_property
     def _rates(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """One over the time between samples of the gyro (B, G - 1, 1), and 1 where both are there; None without a
-        gyro."""
+        """One over the time between samples of the gyro (B, G - 1, 1), and 1 where both are there; None without one."""
         one = self.measured
         if one.gyro_t is None or one.gyro_mask is None or self.noise.gyro is None:
             return None
@@ -220,8 +219,7 @@ class Objective:
         return np.concatenate([piece, np.arange(pairs) * count // max(pairs, 1)])
 
     def own_frame(self, residual: np.ndarray) -> np.ndarray:
-        """(B, K) residuals of pose, odometry and gyro; those of the outside position along and across the start's
-        heading."""
+        """(B, K) residuals of pose, odometry and gyro; the outside position along and across the start's heading."""
         tables = (self.measured.pose, self.measured.odometry)
         sizes = [table[0].size for table in tables]
         pose = residual[:, : sizes[0]].reshape(tables[0].shape)
@@ -333,8 +331,8 @@ class _StartError:
 
     @classmethod
     def of(cls, values: Any, origin: np.ndarray, weight: np.ndarray, residual: Any) -> _StartError:
-        """That of poses: values (N, B, M, C) begin with x, y, yaw; origin (B, 2); weight (B, M, C); residual (N, B, M
-        C) white."""
+        """That of poses: values (N, B, M, C) of x, y, yaw, ...; origin (B, 2); weight (B, M, C); residual (N, B, M C).
+        """
         arm = namespace(values).nan_to_num(values[..., :2] - origin[:, None, :])
         return cls(arm, weight, huber_weight(residual.reshape(values.shape)[..., :3]))
 

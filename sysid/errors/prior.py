@@ -23,8 +23,7 @@ EXPECTED = {
     "wheels.difference": 0.02, "odometry_scale.linear": 0.03, "odometry_scale.angular": 0.05,
     "pose_mount.x": 0.2, "pose_mount.y": 0.2, "pose_mount.yaw": 0.2, "gyro_bias.bias": 0.02, "gyro_bias.scale": 0.02,
 }
-"""How far data sheets, rulers and hand-drawn markers are usually off (standard deviations), where bounds say much
-less."""
+"""How far data sheets, rulers and hand-drawn markers are usually off (standard deviations), if bounds say less."""
 RELATIVE = {"wheels.radius": 0.03, "wheels.track": 0.05}  # the same as shares of what a robot file says
 QUANTILE = 1.645  # of the normal distribution, of the 90 % intervals in vehicle files
 

@@ -212,8 +212,7 @@ def is_delay(name: str) -> bool:
 
 
 class Residuals(Protocol):
-    """Residuals (N, B, K) of unit coordinates (N, P), and derivatives (N, B, K, P); summed up by `equations` unless
-    None."""
+    """Residuals (N, B, K) of unit coordinates (N, P), and derivatives (N, B, K, P), or what `equations` sum up."""
 
     @property
     def space(self) -> Space: ...

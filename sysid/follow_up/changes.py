@@ -53,8 +53,7 @@ def worse(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def paired(trials: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], rng: np.random.Generator) -> dict[str, Any]:
-    """Mean RMSE before and after, and the interval of the change, from times (T,) and squared errors (T,) of each
-    trial."""
+    """Mean RMSE before and after, and the interval of its change, from times (T,) and squared errors (T,) of trials."""
     ends = np.array([[np.sqrt(one[1].mean()), np.sqrt(one[2].mean())] for one in trials]).mean(0)
     drawn = np.stack([_drawn(*one, rng) for one in trials])  # (trials, RESAMPLES)
     picked = rng.integers(0, len(trials), (len(trials), RESAMPLES))

@@ -125,8 +125,7 @@ def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[
 
 
 def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[PlannedDrive]:
-    """Every manoeuvre at several sizes and start headings [degrees], within speeds, space and time of the training
-    trials."""
+    """Every manoeuvre at several sizes and start headings [degrees], within speeds, space and time of the training."""
     trials = result.log.training
     v = max(max(float(trial.command.v.max()) for trial in trials), 0.1)
     omega = max(float(np.abs(trial.command.omega).max()) for trial in trials) or min(result.log.spec.omega_max, 0.5)
@@ -209,8 +208,7 @@ def plan_drives(result: Result, drives: Drives, library: Sequence[PlannedDrive])
 def separations(
     result: Result, refitter: Refitter, groups: Sequence[Sequence[Rival]], library: Sequence[PlannedDrive]
 ) -> tuple[np.ndarray, list[PlannedDrive]]:
-    """Separation (D, pairs) of the most promising drives, and these drives; pairs as in `itertools.combinations` of
-    groups."""
+    """Separation (D, pairs) by the most promising drives, and these drives; pairs as `combinations` of each group."""
     flat = [one for group in groups for one in group]
     place = {id(one): i for i, one in enumerate(flat)}
     pairs = [(place[id(a)], place[id(b)]) for group in groups for a, b in combinations(group, 2)]
@@ -259,8 +257,7 @@ def _own_columns(refitter: Refitter, drives: Drives, fit: Refit, at: np.ndarray)
 
 
 def _held(result: Result, fit: Refit) -> np.ndarray:
-    """(P + k, P + k) precision of a rival on a new day: base by the spread, coordinates by these drives and their
-    wander."""
+    """(P + k, P + k) precision of a rival on a new day: base by the spread, coordinates by drives and wander."""
     size = len(fit.u)
     flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
     matrix = flat.T @ flat

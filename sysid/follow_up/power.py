@@ -87,8 +87,7 @@ def power_curve(days: Days, hypothesis: int, q: np.ndarray, alpha: float) -> lis
 
 
 def smallest(days: Days, alpha: float, effects: Sequence[Effect]) -> list[tuple[float, float]]:
-    """Of each effect the factor on its size at which it is noticed with 80 % power, by bisection within `REACH`, and
-    its power."""
+    """Of each effect the factor on its size (within `REACH`) at which it is noticed with 80 % power, and its power."""
     low, high = np.full(len(effects), 1 / REACH), np.full(len(effects), REACH)
     power = np.ones(len(effects))
     for number in range(HALVINGS + 1):

@@ -159,8 +159,7 @@ class WrenchTable:
 
     @property
     def roughness(self) -> np.ndarray:
-        """(KNOTS, KNOTS) of a table: squares of its second differences (a map's along both ways), and a bit of its own.
-        """
+        """(KNOTS, KNOTS) of a table: squares of second differences (a map's both ways), and a bit of its own."""
         if self.quantity == MAP:
             bend = np.concatenate([np.kron(np.eye(ROWS), _bends(ACROSS)), np.kron(_bends(ROWS), np.eye(ACROSS))])
         else:
@@ -168,8 +167,7 @@ class WrenchTable:
         return np.asarray(bend.T @ bend + SHRINK * np.eye(KNOTS))
 
     def parameters(self, wrench: np.ndarray, start: float = 0.0) -> dict[str, float]:
-        """Parameters of the effect for a table (2 KNOTS,) of forces [N], then torques [N m], and a wheel's start angle
-        [rad]."""
+        """Parameters of the effect for a table (2 KNOTS,) of forces [N] and torques [N m], and a start angle [rad]."""
         number = list(QUANTITIES).index(self.quantity) + 1
         found = {"quantity": float(number), "low": self.low, "high": self.high, "low_y": self.low_y,
                  "high_y": self.high_y, "with_motion": float(self.kind == "brake"), "start_angle": start}
@@ -210,8 +208,7 @@ class Products:
 def multiplied(
     residual: np.ndarray, jacobian: np.ndarray, columns: np.ndarray, groups: Sequence[Sequence[int]]
 ) -> Products:
-    """Products by groups of trials: residual (B, n), Jacobian (B, n, P) of the base, columns (B, n, S) of the tables.
-    """
+    """Products by groups of trials: residual (B, n), Jacobian (B, n, P) of the base, columns (B, n, S) of tables."""
     design = np.concatenate([jacobian, columns], axis=-1)
     flat = [design[list(group)].reshape(-1, design.shape[-1]) for group in groups]
     rest = [residual[list(group)].reshape(-1) for group in groups]
@@ -307,8 +304,7 @@ def turned(table: WrenchTable, columns: np.ndarray, residual: np.ndarray) -> tup
 def from_first_wave(
     terms: Sequence[Term], coefficients: Sequence[np.ndarray]
 ) -> tuple[tuple[np.ndarray, ...], float]:
-    """The same waves counted from where the first of the force rises through zero; by how much more drives start [rad].
-    """
+    """The same waves counted from where the first of the force rises through zero, and the angle [rad] to there."""
     first = next((values for term, values in zip(terms, coefficients, strict=True)
                   if term.form == "harmonic" and term.number == 1), None)
     if first is None:

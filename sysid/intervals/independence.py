@@ -207,8 +207,8 @@ def _widest(
 def _flipped(
     evidence: Information, kind: Kind, inverse: np.ndarray, random: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """How far estimates are off (N, P), and scores (N, B, K, P) there, with random signs of blocks; some `FLIPS` at a
-    time."""
+    """How far estimates are off (N, P), and scores (N, B, K, P) there, with random signs of blocks, `FLIPS` at a time.
+    """
     moves = kind.sandwich.moves[kind.label]  # (B, K, P, P)
     errors = np.einsum("pr,bkrq,bkq->bkp", np.linalg.inv(inverse), moves, evidence.scores, optimize=True)
     count = max(AT_ONCE // errors.size, 1)

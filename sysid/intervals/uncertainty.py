@@ -91,8 +91,7 @@ def evidence_of(objective: DriveResiduals, u: np.ndarray, robust: bool = False) 
 
 
 def _ahead(objective: DriveResiduals, found: Information, robust: bool) -> np.ndarray:
-    """(2, P) how many times as wide each interval is from its lower and upper end; 1 unless the parameter is one of
-    `BENT`."""
+    """(2, P) how many times as wide intervals of `BENT` parameters are from their lower and upper ends; 1 of others."""
     space, u = objective.space, found.u
     errors, ahead = errors_of(found), np.ones((2, space.size))
     reach, inverse = errors.quantile * errors.deviation, found.inverse
@@ -124,8 +123,8 @@ def stretched(ahead: np.ndarray) -> np.ndarray:
 
 
 def _evidence_at(objective: DriveResiduals, u: np.ndarray, robust: bool, over: np.ndarray | None = None) -> Information:
-    """Information of drives at a point u (P,), by slopes averaged over errors of a covariance `over` (P, P), or those
-    there."""
+    """Information of drives at a point u (P,), by slopes averaged over errors of a covariance (P, P), or those there.
+    """
     space = objective.space
     if over is not None:
         residual, jacobian = average_slopes(objective, u, over)

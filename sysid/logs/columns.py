@@ -184,8 +184,7 @@ def guess(
 
 
 def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:
-    """Unit of each column, by role and name, that most moving drives show; one that shows it for sure counts a little
-    more."""
+    """Unit of each column, by role and name, that most moving drives show; sure ones count a little more."""
     votes: dict[tuple[str, str], Counter[str]] = {}
     for columns in drives:
         for one in columns:

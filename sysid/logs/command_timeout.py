@@ -67,8 +67,7 @@ def command_timeout(trials: Sequence[Trial]) -> Timeout | None:
 
 
 def with_own_timeout(log: Log) -> Log:
-    """The log with the stops that its base makes by itself, where training trials show them and it states none; with
-    a note."""
+    """The log with the stops that its base makes by itself, where training trials show them, and a note."""
     if "command_timeout" in log.fields or log.fields.get("input") == "wheels":
         return log
     found = command_timeout(log.training)

@@ -46,8 +46,7 @@ MOST, FAST, RATE_STEP = 0.15, 0.2, 0.005  # by which a clock may run fast or slo
 def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
     """Sentences for "odometry" and "ground_truth" on what contradicts the speeds beside it.
 
-    Args:
-        reach: how far from the axle's centre a tracked point may be [m]. That of the odometry is the centre.
+    `reach`: how far from the axle's centre a tracked point may be [m]. That of the odometry is the centre.
     """
     found: dict[str, list[str]] = {}
     for name in ("odometry", "ground_truth"):
@@ -121,11 +120,7 @@ def _likeness(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds beside it") -> str:
-    """A sentence on a stream of which most trials come later or earlier than the speeds beside it; else empty.
-
-    Args:
-        beside: "commands" compares with these, though there is an odometry.
-    """
+    """A sentence on a stream of which most trials are late or early beside the speeds (or "commands"); else ""."""
     lates = [late for trial in trials if (late := lateness(trial, name, beside == "commands")) is not None]
     if len(lates) <= len([trial for trial in trials if getattr(trial, name) is not None]) / 2:
         return ""
@@ -136,12 +131,7 @@ def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds besi
 
 
 def running_fast(name: str, trials: Sequence[Trial], beside: str = "commands") -> str:
-    """A sentence on a stream whose clock runs faster or slower than that of the odometry or of the commands; else
-    empty.
-
-    Args:
-        beside: "odometry" or "commands".
-    """
+    """A sentence on a stream whose clock runs faster or slower than that of "odometry" or "commands"; else ""."""
     rates = np.arange(-FAST, FAST + RATE_STEP / 2, RATE_STEP)
     curves = [curve for trial in trials if (curve := _unlikeness(trial, name, beside, rates)) is not None]
     if not curves:
@@ -167,10 +157,7 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
     """By how much a pose's motion comes later than the speeds beside it [s], where that is more than a fit reaches and
     explains what nothing else does; None otherwise.
 
-    Rates of turning and of motion are compared: no frame changes them.
-
-    Args:
-        beside: compare with the commands, though there are measured speeds.
+    Rates of turning and motion are compared: no frame changes them. `beside`: with the commands in any case.
     """
     source, odometry = getattr(trial, name), trial.odometry
     if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
@@ -203,8 +190,7 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
 
 
 def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.ndarray | None:
-    """How little a stream's motion is like that beside it if its clock runs fast by each of some shares (R,), at
-    whatever delay suits best; None where too little moves."""
+    """How little a stream's motion is like that beside it, at the best delay, if its clock is fast by shares (R,)."""
     ours = speeds(trial, name, smooth=True)
     theirs = _commanded(trial) if beside == "commands" else speeds(trial, "odometry", smooth=True)
     if ours is None or theirs is None:
@@ -233,8 +219,7 @@ def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _likeness_by_lag(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Likeness (2T - 1,) of rates (T,) with others (T,) that come so many rows earlier, from 1 - T; outside of them
-    nothing moves."""
+    """Likeness (2T - 1,) of rates (T,) with others (T,) so many rows earlier, from 1 - T; outside nothing moves."""
     size = 2 * len(ours)
     found = np.fft.irfft(np.fft.rfft(ours, size) * np.conj(np.fft.rfft(theirs, size)), size)
     return np.roll(found, len(ours) - 1)[: size - 1] / max(float(np.linalg.norm(ours) * np.linalg.norm(theirs)), 1e-9)
@@ -256,8 +241,7 @@ def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
 
 
 def _empty_shares(trial: Trial) -> tuple[float, float] | None:
-    """Shares of the time in which the pose travels and v is exactly zero, and in which it turns and omega is; nan where
-    it does not."""
+    """Shares of the time in which the pose travels and v is exactly zero, or it turns and omega is; or nan."""
     stream = trial.odometry
     if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < 20:
         return None

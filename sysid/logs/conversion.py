@@ -114,8 +114,7 @@ class Source:
 
 
 def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
-    """Write the dataset and load it again: the log as the fit will see it, and notes on what was chosen and left out.
-    """
+    """Write the dataset and load it again: the log that a fit will see, and notes on what was chosen and left out."""
     if not config.source.is_dir() and not config.source.is_file():
         what = "a pipe or a device" if config.source.exists() else "does not exist"
         raise FileNotFoundError(f"{config.source}: {what}. Give a ROS bag, a CSV file, a folder of them, or a measured "
@@ -255,8 +254,7 @@ def _text_drives(
 def bag_drives(
     path: Path, config: ConvertConfig, spec: VehicleSpec, wheels: bool = False
 ) -> tuple[list[Drive], list[str]]:
-    """Trials of one bag, and notes; `spec` has the geometry of wheels whose angles or rates are the input or the
-    odometry."""
+    """Trials of one bag, and notes; `spec` has the geometry of wheels whose angles or rates were recorded."""
     asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic,
              "imu": config.imu_topic}
     topics = {name: topic for name, topic in asked.items() if topic is not None}

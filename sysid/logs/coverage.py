@@ -122,8 +122,7 @@ def replicate_spread(trials: tuple[Trial, ...]) -> list[ReplicateGroup]:
 def sanity(log: Log, responses: Responses | None = None) -> list[str]:
     """Signs that a column has another unit, sign or origin than it should, as sentences.
 
-    Args:
-        responses: `response_shift` of every trial by channel, where it is known.
+    `responses`: `response_shift` of every trial by channel, where it is known.
     """
     standing = stood(log.trials, log.spec.track / 2)
     if standing:
@@ -232,8 +231,7 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
 
 
 def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
-    """A sentence where the measured speed follows the commanded yaw rate and the other way round, and not its own
-    command, which in a circle is much like the other; else empty."""
+    """A sentence where measured speed follows the commanded yaw rate, and the reverse, not its own; else ""."""
     other = [replace(one, command=Command(one.command.t, one.command.omega, one.command.v)) for one in trials]
     for index in (1, 2):
         as_it_is, follows = ([gain[1] for one in these if (gain := _gain(one, channel, index)) is not None]
@@ -247,8 +245,7 @@ def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
 
 
 def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:
-    """Size of a measured speed (1) or yaw rate (2) that larger commands do not raise, while it follows smaller ones;
-    None where nothing shows such a limit."""
+    """Size of a measured speed (1) or yaw rate (2) that larger commands, unlike smaller ones, do not raise, or None."""
     rows = []
     for trial in trials:
         rates = speeds(trial, channel)

@@ -80,8 +80,7 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
 
 
 def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
-    """Direction in which a pose travels; `reach`: how far its point may be from the axle's centre [m]; `mirrored`: y
-    negated."""
+    """Direction in which a pose travels, whose point is at most `reach` off the axle's centre [m]; `mirrored`: -y."""
     x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
     cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
     along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)

@@ -49,8 +49,7 @@ GYRO_COLUMNS = ("t", "gyro")
 
 
 def load_log(folder: str | Path) -> Log:
-    """Load a driving-log dataset; FileNotFoundError or ValueError names the file, the value, the rule and the remedy.
-    """
+    """Load a driving-log dataset; FileNotFoundError or ValueError names the file, value, rule and remedy."""
     folder = Path(folder)
     if not folder.is_dir():
         what = "a file" if folder.exists() else "no such folder"
@@ -76,8 +75,7 @@ def load_log(folder: str | Path) -> Log:
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
-    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: it holds the
-    last)."""
+    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never)."""
     command_columns = read_csv(folder / "command.csv", COMMAND_COLUMNS)
     command = Command(**{name: command_columns[name] for name in COMMAND_COLUMNS})
     odometry = ground_truth = None
@@ -200,8 +198,7 @@ def check_same_vehicle(
     log: Log, spec: VehicleSpec, place: str, rule: str,
     names: tuple[str, ...] = ("wheel_radius", "track", "wheelbase", "drive"),
 ) -> None:  # fmt: skip
-    """Raise ValueError where a vehicle given beside a log differs in a field of `names`; it names `place` and the
-    `rule`."""
+    """Raise ValueError where a vehicle given beside a log differs in a field of `names`, by `place` and `rule`."""
     for name in names:
         mine, theirs = getattr(log.spec, name), getattr(spec, name)
         if mine != theirs:
@@ -236,8 +233,7 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 
 def _check_seconds(folder: Path, times: dict[str, np.ndarray]) -> None:
-    """Refuse rows that are as far apart as no recording's are, in times (T,) of each file: milliseconds or smaller
-    units."""
+    """Refuse times (T,) of files that are as far apart as no recording's are: milliseconds or smaller units."""
     steps = {name: float(np.median(np.diff(t))) for name, t in times.items() if len(t) > 1}
     spans = {name: float(t[-1] - t[0]) for name, t in times.items() if len(t) > 1}
     for name, t in times.items():

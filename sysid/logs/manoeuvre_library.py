@@ -181,8 +181,7 @@ def as_trial(candidate: Candidate, channels: str = "both", sigma: tuple[float, f
 
 
 def placement(path: np.ndarray, limits: Limits) -> tuple[float, float, float] | None:
-    """Start pose (x, y [m] from a corner of the room, heading [rad]) that keeps a path (T, 2) [m] inside; None
-    without one."""
+    """Start pose (x, y [m] from a corner of the room, heading [rad]) that keeps a path (T, 2) [m] inside, or None."""
     length, width = (side - 2 * limits.margin for side in limits.room)
     best: tuple[float, tuple[float, float, float]] | None = None
     for yaw in np.deg2rad(np.arange(0.0, 180.0, 5.0)):

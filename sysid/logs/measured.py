@@ -391,8 +391,8 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
 
 
 def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
-    """Numbers by column (nan where none), times and whether calibrating, of a continuous log after its first row, a
-    filler."""
+    """Numbers by column (nan where none), times and whether calibrating, of a continuous log; its first row is filler.
+    """
     rows = csv_rows(path, read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}."))
     header = next(rows, (0, []))[1]
     for name in (*CONTINUOUS_COLUMNS, "ros_time", "calib_state"):

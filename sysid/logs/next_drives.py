@@ -22,8 +22,7 @@ SIZES = (1.0, 0.7, 0.5, 0.35)  # of the speeds that are tried where the floor is
 LONGEST = 20.0  # s of motion
 DT = 0.1  # s between commands
 UNCERTAINTY, REACTION = 0.15, 0.25
-"""How much faster or slower than commanded, and for how long [s] after a stop, the vehicle may drive, as
-`bridge.manoeuvre`."""
+"""How much faster or slower than commanded, and how long [s] after a stop, it may drive, as `bridge.manoeuvre`."""
 STEP = 0.05  # s of the floor that is needed
 SHARE = 0.5  # of the vehicle's limits that a script uses
 FASTEST = (0.5, 0.8)  # m/s and rad/s that no script exceeds by default

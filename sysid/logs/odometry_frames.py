@@ -40,8 +40,7 @@ class Stretches:
 
 
 def at_frames(trials: Sequence[Trial], period: float | None) -> tuple[Trial, ...]:
-    """Trials with the odometry's rows at the times of their frames, the latest that the steps allow; `period` [s], or
-    None."""
+    """Trials with the odometry's rows at the times of their frames, the latest that steps of `period` [s] allow."""
     return tuple(trials) if period is None else tuple(_at_frames(trial, period) for trial in trials)
 
 
@@ -111,8 +110,7 @@ def stretches(trial: Trial, number: int = 0, largest: float | None = None) -> St
 
 
 def unexplained(part: Stretches, period: float, group: np.ndarray, phases: int = PHASES) -> float:
-    """Squared ways [m^2 or rad^2] that frames of a period [s] leave, each group (S,), of rising numbers, at its best
-    phase."""
+    """Squared ways [m^2 or rad^2] that frames of a period [s] leave, each group (S,) at its best phase."""
     left = _left(part, period, np.arange(phases) / phases)
     return float(np.add.reduceat(left, np.flatnonzero(np.diff(group, prepend=-1)), axis=1).min(0).sum())
 

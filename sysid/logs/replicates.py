@@ -92,8 +92,7 @@ def shift_between(a: Course, b: Course) -> float | None:
 
 
 def near(a: Course, b: Course, most: float) -> bool:
-    """Whether the commands of two drives, which begin at most `most` s apart in their recordings, are nearly the
-    same."""
+    """Whether the commands of two drives, which begin at most `most` s apart in recordings, are nearly the same."""
     if len(a.command.t) == len(b.command.t) and np.allclose(a.command.t, b.command.t, atol=ROUNDED):
         ours, theirs = a.command.table[:, 1:], b.command.table[:, 1:]
     elif not (a.moves and b.moves and abs(a.begin - b.begin) <= most + EXACT
@@ -141,8 +140,7 @@ def may_be_alike(a: Glance, b: Glance) -> bool:
 
 
 def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]]:
-    """Indices of trials of one manoeuvre with the same commands, at most `most` s apart, by first appearance; single
-    ones too."""
+    """Indices of trials of one manoeuvre with the same commands, at most `most` s apart; single ones too."""
     courses = [course_of(trial) for trial in trials]
     glances = [glance(course) for course in courses]
     groups: list[list[int]] = []

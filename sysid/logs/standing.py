@@ -1,6 +1,7 @@
-"""Drives in which a vehicle stands though it is commanded to move as it did elsewhere: its emergency stop was pressed,
-its motors were off, or its wheels were blocked. They say nothing of how it drives, and would be fitted as a drive that
-hardly follows its commands.
+"""Drives in which a vehicle stands though commanded to move as it did elsewhere: emergency stop, motors off, wheels
+blocked.
+
+They say nothing of how it drives, and would be fitted as a drive that hardly follows its commands.
 """
 
 from __future__ import annotations
@@ -23,10 +24,8 @@ SLOWEST = 0.1  # quantile of the commands at which it does, below which its dead
 
 def stood(trials: Sequence[Trial], reach: float) -> list[str]:
     """Names of the trials in which the vehicle stands, though commanded to move as fast as where it moves in others.
-    Smaller commands that do not move it show its dead zone.
 
-    Args:
-        reach: of a wheel from the middle [m], by which yaw rates count as speeds.
+    Smaller commands that do not move it show its dead zone. `reach` of a wheel [m]: by it yaw rates count as speeds.
     """
     seen = {trial.name: sizes_of(trial, reach) for trial in trials}
     asked = {name: _size(one[0]) for name, one in seen.items()}
@@ -39,8 +38,7 @@ def stood(trials: Sequence[Trial], reach: float) -> list[str]:
 
 
 def sizes_of(trial: Trial, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Commanded and measured speeds (T,) [m/s], of odometry or outside pose, whichever moves more; none where neither
-    shows any."""
+    """Commanded and measured speeds (T,) [m/s], of odometry or outside pose, whichever moves more, or empty."""
     found = []
     for channel in ("odometry", "ground_truth"):
         rates = speeds(trial, channel)
@@ -60,11 +58,7 @@ def _size(values: np.ndarray) -> float:
 def without_standing(log: Log, place: str) -> Log:
     """The log without training trials in which the vehicle stands though commanded to move, and a note that names them.
 
-    Args:
-        place: the log, for an error.
-
-    Raises:
-        ValueError: it moves in no training trial.
+    ValueError, which names the `place`, where it moves in no training trial.
     """
     gone = {name for name in stood(log.trials, log.spec.track / 2)} & {trial.name for trial in log.training}
     if not gone:

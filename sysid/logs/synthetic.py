@@ -39,8 +39,7 @@ def write_dataset(
     folder: str | Path, spec: VehicleSpec, params: Any, schedule: Schedule = Schedule(), *,  # noqa: B008
     noise: SensorNoise | None = None, plant: Plant | None = None,
 ) -> Path:
-    """Drive the manoeuvres with the vehicle `spec`, `params` (the planted truth), or with `plant`, and write the
-    dataset."""
+    """Drive the manoeuvres with the vehicle `spec`, `params` (the planted truth), or `plant`, and write a dataset."""
     folder, noise = Path(folder), noise or SensorNoise()
     random = np.random.default_rng(schedule.seed)
     plant = plant or vehicle_plant(spec)

@@ -115,8 +115,7 @@ def join_drives(
     source: Path, groups: Sequence[tuple[str, list[Table]]], said: Sequence[str], geometry: tuple[float, float],
     wheels: bool = False,
 ) -> tuple[list[TextDrive], list[str]]:
-    """Drives of tables, by the name of each drive; otherwise as `read_drives`. One that is not clear does not keep out
-    the others."""
+    """Drives of tables by name, otherwise as `read_drives`; one that is not clear does not keep out the others."""
     units = shown_units([guess(tables, _said_of(tables, said)) for _, tables in groups]) if len(groups) > 1 else {}
     drives: list[TextDrive] = []
     refused: list[ValueError] = []
@@ -480,8 +479,7 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
 def _stream(
     stream: str, tables: Sequence[Table], columns: Sequence[Column]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Rows of a stream in SI units in order of time, by quantity and "t", and notes; those with an empty cell are left
-    out."""
+    """Rows of a stream in SI units in order of time, by quantity and "t", without those with an empty cell; notes."""
     mine = [one for one in columns if one.role.startswith(f"{stream}.")]
     if not mine:
         return {}, []
@@ -541,8 +539,7 @@ def _spread(t: np.ndarray) -> np.ndarray | None:
 
 
 def _check_clock(file: str, t: np.ndarray) -> list[str]:
-    """Notes on a stream's time (T,); ValueError where it goes back by more than rows out of order do: sorted it would
-    mix."""
+    """Notes on a stream's time (T,); ValueError where it goes back by more than rows out of order do."""
     steps = np.diff(t)
     if (steps < 0).sum() > len(steps) / 2:
         return [f"{file}: its newest row comes first; its rows are turned round"]

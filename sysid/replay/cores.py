@@ -20,8 +20,7 @@ def on_processor() -> bool:
 
 
 def on_all_cores(work: Callable[[_Part], _Done], parts: Sequence[_Part], compiled: bool = True) -> list[_Done]:
-    """What `work` gives for each of `parts`, in order, side by side on all cores; not `compiled`: the first goes ahead.
-    """
+    """What `work` gives for each of `parts`, side by side on all cores; unless `compiled`, the first goes ahead."""
     workers = min(cores(), len(parts))
     if workers < 2:
         return [work(part) for part in parts]

@@ -78,8 +78,7 @@ class CourseReplay:
 
     @cached_property
     def in_pieces(self) -> CourseReplay:
-        """The same with drives in pieces side by side where it is traced, if they are long, start at rest and may be
-        anywhere."""
+        """The same with drives in pieces side by side, if they are long, start at rest and may be anywhere."""
         batch = self._replay.batch
         records, step = batch.command.shape[1], self._record
         count = pieces.count(records * step)

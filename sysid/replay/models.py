@@ -51,8 +51,7 @@ class Twin:
     spec: VehicleSpec
     params: VehicleParams
     shared: Mapping[str, tuple[str, float, float]]
-    """Parameter of the model -> that of the vehicle with its meaning, and the factor and offset that its value takes
-    there."""
+    """Parameter of the model -> that of the vehicle, and the factor and offset that its value takes there."""
 
 
 @dataclass(frozen=True)
@@ -144,8 +143,7 @@ def effects_around(model: Model, trials: tuple[Trial, ...]) -> tuple[str, ...]:
 
 
 def calibrated(model: Model, trials: tuple[Trial, ...]) -> tuple[Model, tuple[str, ...]]:
-    """A model with `effects_around` it, and names of their parameters that a fit leaves alone (limits beside wheels'
-    own)."""
+    """A model with `effects_around` it, and names of their parameters that a fit leaves alone."""
     names = effects_around(model, trials)
     limit = make_effects(("acceleration_limit",))[0]
     if limit.name not in names or limit.name in {effect.name for effect in model.params.effects}:

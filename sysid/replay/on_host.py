@@ -90,8 +90,7 @@ class HostReplay:
 
 
 def _in_blocks(function: Callable[..., Any], *arrays: np.ndarray) -> Any:
-    """What a function makes of arrays (N, ...), in blocks of `MANY` or `FEW` rows, the last filled up with its last
-    row."""
+    """What a function makes of arrays (N, ...), in blocks of `MANY` or `FEW` rows; the last is filled up."""
     count, found = len(arrays[0]), []
     size = FEW if count <= FEW else MANY
     for first in range(0, count, size):

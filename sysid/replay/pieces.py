@@ -17,8 +17,8 @@ from sysid.logs.records import Trial, command_in_force
 
 LENGTH = 2.75  # s, of a piece
 OVERLAP = 2.0
-"""Time that is replayed before each [s]: whitened motion then differs by 0.2 of its noise (0.05 with 3 s, 0.3 with 1.5
-s)."""
+"""Time that is replayed before each [s]: whitened motion differs by 0.2 of its noise (0.05 with 3 s, 0.3 with 1.5 s).
+"""
 AROUND = 0.1  # s, over which the speeds at the begin of a piece are averaged
 
 

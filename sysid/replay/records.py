@@ -44,11 +44,9 @@ class Plant:
     substeps: Callable[[Any, Any, jax.Array], Any] | None = None
     """(params, state, commands (K, 2)) -> state after K physics steps, where there is a quicker way than one by one."""
     record: Callable[[Any, Any, jax.Array], jax.Array] | None = None
-    """(params, state, commands (R, K, 2)) -> observed (R, 9) after each K physics steps, where an accelerator has a
-    quicker way."""
+    """(params, state, commands (R, K, 2)) -> observed (R, 9) after each K physics steps, if there is a quicker way."""
     frame: float | None = None
-    """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed
-    once a frame."""
+    """Time between frames of the odometry [s], if known: speeds are means over it, low-passed once a frame."""
     host: Host | None = None  # where the host steps it more quickly
     arithmetic: bool = False
     """Whether its steps are arithmetic on single numbers, without products of matrices or solvers."""

@@ -300,8 +300,7 @@ def _begun(
 
 
 class _Programs:
-    """`path_of` for rows of drives in three programs; the large one, slow to compile, serves drives of any length
-    (`ROOMS`)."""
+    """`path_of` for rows of drives in three programs; the large one serves drives of any length (`ROOMS`)."""
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
         in_one = as_one_function if rows <= IN_ONE and plant.arithmetic else lambda function: function

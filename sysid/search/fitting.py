@@ -124,8 +124,7 @@ def fit_log(
 def _first_points(
     log: Log, given: Problem, config: FitConfig, stages: Stages
 ) -> tuple[FitResult | None, FitResult | None, np.ndarray]:
-    """Results of the global search and of that on features, where the method has them, and points (S, P) that LM starts
-    from."""
+    """Results of the global search and of that on features, where there is one, and points (S, P) for LM."""
     space, objective = given.space, given.objective
     points = least_squares.random_starts(space, config.starts, config.seed)
     if config.method in (*settings.GLOBAL, "both"):
@@ -294,8 +293,7 @@ def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial,
 
 
 def fitted_plant(spec: VehicleSpec) -> Plant:
-    """The simulator's vehicle with a fit's default physics step, which is part of a model: for logs with planted truth.
-    """
+    """The simulator's vehicle with a fit's default physics step, for logs with planted truth."""
     return vehicle_plant(spec, VehicleConfig(physics_dt=FitConfig.physics_dt))
 
 

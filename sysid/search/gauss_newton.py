@@ -14,8 +14,7 @@ AT_WALL = 1e-6
 def normal_sums(
     residual: np.ndarray, jacobian: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Half the gradients (N, P) and Gauss-Newton Hessians (N, P, P) of weighted squares of residuals (N, ...), by
-    derivatives."""
+    """Half the gradients (N, P) and Gauss-Newton Hessians (N, P, P) of weighted squares of residuals (N, ...)."""
     axes, residual = "abcd"[: jacobian.ndim - 2], residual.reshape(jacobian.shape[:-1])
     pulls, columns = (residual, jacobian) if weight is None else (residual * weight, jacobian * weight[..., None])
     return (np.einsum(f"n{axes}p,n{axes}->np", jacobian, pulls),
@@ -43,8 +42,7 @@ class BoxStep:
     ridge: float = 0.0  # share of the largest curvature that is added whatever the damping
 
     def points(self, u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any) -> np.ndarray:
-        """The points (N, P) to which steps from u (N, P) lead, with half gradients (N, P) and Hessians (N, P, P), or
-        one for all."""
+        """The points (N, P) to which steps from u (N, P) lead, by half gradients (N, P) and Hessians (N, P, P)."""
         count, size = u.shape
         reach = self.reach(u) if callable(self.reach) else self.reach
         gradient, low, high, reach, free = (

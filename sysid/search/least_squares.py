@@ -204,8 +204,8 @@ class _Tangent:
 
     def followed(self, objective: Residuals, points: np.ndarray, held: np.ndarray, robust: bool
                  ) -> tuple[np.ndarray, np.ndarray]:
-        """Costs (E,) and points (E, P) after a damped Gauss-Newton step of all but the `held` (E,) parameter, where it
-        is better."""
+        """Costs (E,) and points (E, P) after a Gauss-Newton step of all but the `held` (E,) parameter, if it is better.
+        """
         residual = objective.residuals(points)
         weight = huber_weight(residual) if robust else np.ones_like(residual)
         pulls = np.einsum("bkp,nbk->np", self.jacobian, residual * weight, optimize=True)

@@ -21,8 +21,7 @@ from sysid.search.result import FitResult, Progress
 SCAN = 256
 """Random points that are replayed for one start; a search from a random point itself ends in the nearest valley."""
 KEPT, FIRST = 8, 3
-"""The best of them, and the iterations from each: two of eight lead to the deepest valley, and a few nearly show which.
-"""
+"""The best of them, and iterations from each: two of eight lead to the deepest valley, a few nearly show which."""
 FOLLOWED, STEPS = 2, 20  # how many of those are searched further, and in how many iterations at most
 EDGE = 0.02  # of the range, at both ends, without random points
 CHUNK = 512  # points whose residuals are kept at once

@@ -123,8 +123,7 @@ class _Follow:
 
 
 def _folds(evidence: Information) -> np.ndarray:
-    """(B, PIECES) number of the part that each piece is held back with: a manoeuvre, a drive, or half of the only one.
-    """
+    """(B, PIECES) number of the part that each piece is held back with: a manoeuvre, a drive, or half of one."""
     drives = len(evidence.groups)
     numbers = evidence.groups if len(np.unique(evidence.groups)) > 1 else np.arange(drives)
     if drives > 1:
@@ -133,8 +132,7 @@ def _folds(evidence: Information) -> np.ndarray:
 
 
 def _held_back(follow: _Follow, poses: Objective, held: np.ndarray, robust: bool) -> np.ndarray:
-    """(G, O) squared errors of whole poses in each part of the drives that is held back, of each option `held` (O, P).
-    """
+    """(G, O) squared errors of whole poses in each part of the drives that is held back, of options `held` (O, P)."""
     folds = _folds(follow.evidence)
     numbers = np.unique(folds)
     points = np.stack([[follow(one, folds != number) for one in held] for number in numbers])  # (G, O, P)

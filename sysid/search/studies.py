@@ -24,8 +24,7 @@ from urllib.parse import unquote, unquote_plus
 import numpy as np
 
 BATCH = {"tpe": 4, "cmaes": 16}
-"""Candidates that are simulated together: of TPE as many as a processor replays at no loss, of CMA-ES its population.
-"""
+"""Candidates simulated together: of TPE as many as a processor replays at no loss, of CMA-ES its population."""
 STARTUP = 32  # random candidates of TPE before it draws from those that it knows
 LEASE = 600.0  # seconds after which a process on another machine that has not been heard of counts as dead
 POLL = 0.2  # s between looks while others finish
@@ -163,8 +162,8 @@ class SharedStudy:
 
     def run(self, costs: Callable[[np.ndarray], np.ndarray], evaluations: int,
             progress: Callable[[int, str], None] | None = None) -> None:
-        """Ask, simulate (unit coordinates (N, P) -> costs (N,), whole batches) and tell until the study has so many
-        costs."""
+        """Ask, simulate (unit coordinates (N, P) -> costs (N,), whole batches) and tell until there are enough costs.
+        """
         best = np.inf
         while True:
             self._beat()
@@ -209,8 +208,7 @@ class SharedStudy:
         return len(left)
 
     def table(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """Unit coordinates (N, P) and costs (N,) of all candidates in order, and which of them has the initial values.
-        """
+        """Unit coordinates (N, P) and costs (N,) of all candidates, and which of them has the initial values."""
         trials = self._study.get_trials(deepcopy=False, states=(self._optuna.trial.TrialState.COMPLETE,))
         trials = sorted(trials, key=lambda trial: trial.number)
         initial = next((i for i, trial in enumerate(trials) if trial.user_attrs.get("initial")), 0)

@@ -31,8 +31,7 @@ def fit(
     objective: Objective, space: Space, search: GlobalSearch, place: StudyPlace = StudyPlace(),  # noqa: B008
     progress: Progress | None = None,
 ) -> FitResult:
-    """Minimise an objective over `space`, from the initial values on; `place` of a study that several processes share.
-    """
+    """Minimise an objective over `space`, from the initial values on, in a study that processes may share."""
     costs: Callable[[np.ndarray], np.ndarray] = {
         "weighted": objective.weighted_cost, "paper": objective.paper_cost}[search.cost]
     about = {"cost": search.cost, "initial values": ", ".join(f"{value:.6g}" for value in space.initial),

@@ -102,7 +102,7 @@ def from_all(
 def _from_ends(
     search: Search, objective: DriveResiduals, result: FitResult, iterations: int, robust: bool
 ) -> FitResult:
-    """The result with where searches from ends of ranges lead that cost little; ends that cost what is here come last.
+    """The result with where searches from ends of ranges lead that cost little, those that cost as much as here last.
     """
     costs, points = least_squares.ends_of_ranges(objective, result.u, robust=robust)
     near, level = costs < FLAT * result.cost, np.abs(costs - result.cost) <= WORTH * result.cost
@@ -113,8 +113,7 @@ def _from_ends(
 def _from_elsewhere(
     search: Search, objective: DriveResiduals, result: FitResult, starts: np.ndarray, iterations: int
 ) -> FitResult:
-    """The result with where a search from other starts (S, P) ends, if that is lower after a few iterations of all of
-    them."""
+    """The result with where a search from other starts (S, P) ends, if that is lower after a few iterations."""
     if not len(starts):
         return result
     spent = result.evaluations
