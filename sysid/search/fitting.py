@@ -37,7 +37,6 @@ from sysid.search.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
-from whill_mjx.vehicle.specs import VehicleSpec
 
 
 @dataclass(frozen=True)
@@ -290,11 +289,6 @@ def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial,
     """Objective over the space's parameters; the others keep their values in `params`."""
     replay, measured = make_replay(plant, params, space, trials)
     return Objective(replay, space, trials, measured, noise)
-
-
-def fitted_plant(spec: VehicleSpec) -> Plant:
-    """The simulator's vehicle with a fit's default physics step, for logs with planted truth."""
-    return vehicle_plant(spec, VehicleConfig(physics_dt=FitConfig.physics_dt))
 
 
 def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list[Prediction]]:

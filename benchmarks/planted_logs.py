@@ -1,4 +1,4 @@
-"""Driving logs from a simulated vehicle with known parameters, in the dataset format: planted truth for tests."""
+"""Driving logs of a simulated vehicle with known parameters, in the dataset format: planted truth."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import numpy as np
 from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.replay.records import Plant
 from sysid.replay.rollout import make_batch, simulate, vehicle_plant
+from sysid.search.settings import FitConfig
 from whill_mjx.logs.dataset import Noise, SensorNoise, write_fields, write_trial
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES, Scenario, command_table
+from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
 
 MEASUREMENT_DT = 0.05  # s
@@ -33,6 +35,11 @@ class Schedule:
     """Sizes of the manoeuvres."""
     seed: int = 0
     """Of start poses and noise."""
+
+
+def fitted_plant(spec: VehicleSpec) -> Plant:
+    """The simulator's vehicle with a fit's default physics step, which is part of a model."""
+    return vehicle_plant(spec, VehicleConfig(physics_dt=FitConfig.physics_dt))
 
 
 def write_dataset(
