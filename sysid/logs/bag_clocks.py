@@ -22,12 +22,9 @@ REGULAR = 0.3  # share of the period that most of the header's stamps vary by at
 class Step:
     """A clock that was set while a bag was recorded."""
 
-    clock: str
-    """"receive" or "header"."""
-    seconds: float
-    """By how much it was set forward; negative where it was set back [s]."""
-    after: float
-    """Since the first header stamp [s]."""
+    clock: str  # "receive" or "header"
+    seconds: float  # by how much it was set forward; negative where it was set back [s]
+    after: float  # since the first header stamp [s]
 
 
 def find_step(received: np.ndarray, stamped: np.ndarray) -> Step | None:

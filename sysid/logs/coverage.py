@@ -37,32 +37,20 @@ SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw",
 class Excitation:
     """What one trial asks of the vehicle. Commands, except where measured is said."""
 
-    v: tuple[float, float]
-    """Least and greatest speed [m/s]."""
-    omega: tuple[float, float]
-    """Least and greatest yaw rate [rad/s]."""
-    reversals: int
-    """Changes of the driving direction."""
-    turn_changes: int
-    """Changes of the turning direction."""
+    v: tuple[float, float]  # least and greatest speed [m/s]
+    omega: tuple[float, float]  # least and greatest yaw rate [rad/s]
+    reversals: int  # changes of the driving direction
+    turn_changes: int  # changes of the turning direction
     slow_seconds: float
     """Time at speeds or yaw rates so low that a dead zone shows, without the other channel moving faster [s]."""
-    steps: int
-    """Changes of the command."""
-    step_sizes: int
-    """Distinct sizes of such changes, to 0.1 m/s and 0.1 rad/s."""
-    acceleration: float
-    """Greatest measured acceleration, over 0.2 s [m/s^2]."""
-    distance: float
-    """Path that the commands ask for [m]."""
-    turn: float
-    """Sum of turning, whatever direction [rad]."""
-    heading: float
-    """Start heading in the room [rad]; nan without outside pose."""
-    headings: float
-    """Share of the circle of headings that is visited, in 30 degree sectors; nan without outside pose."""
-    standstill: tuple[float, float]
-    """Seconds of standstill before and after the drive."""
+    steps: int  # changes of the command
+    step_sizes: int  # distinct sizes of such changes, to 0.1 m/s and 0.1 rad/s
+    acceleration: float  # greatest measured acceleration, over 0.2 s [m/s^2]
+    distance: float  # path that the commands ask for [m]
+    turn: float  # sum of turning, whatever direction [rad]
+    heading: float  # start heading in the room [rad]; nan without outside pose
+    headings: float  # share of the circle of headings that is visited, in 30 degree sectors; nan without outside pose
+    standstill: tuple[float, float]  # seconds of standstill before and after the drive
 
 
 def excitation(trial: Trial) -> Excitation:
@@ -285,8 +273,7 @@ class Blind:
     """One thing that the log does not determine."""
 
     cause: str
-    hidden: str
-    """What stays unknown for that reason."""
+    hidden: str  # what stays unknown for that reason
     remedy: str
 
 

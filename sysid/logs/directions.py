@@ -41,15 +41,11 @@ class Motion:
 class Direction:
     """Which way a pose travels in its own frame."""
 
-    angle: float
-    """To the left of its own heading [rad]."""
+    angle: float  # to the left of its own heading [rad]
     error: float
-    explained: float
-    """Share of the motion that this explains."""
-    gain: float = 1.0
-    """Speed of the pose over the one it should have."""
-    gain_error: float = 0.0
-    """Infinite where the tracked point would be too far off."""
+    explained: float  # share of the motion that this explains
+    gain: float = 1.0  # speed of the pose over the one it should have
+    gain_error: float = 0.0  # infinite where the tracked point would be too far off
 
 
 def motion_of(trial: Trial, name: str) -> Motion | None:

@@ -14,8 +14,7 @@ import numpy as np
 from sysid.logs.records import Log, Trial, command_in_force
 from sysid.logs.streams import speeds
 
-STANDS = 0.1
-"""Share of the commanded speeds (root mean square) below which a vehicle stands: what is left is noise."""
+STANDS = 0.1  # share of the commanded speeds (root mean square) below which a vehicle stands: what is left is noise
 RESPONSE = 0.3  # s, of a usual vehicle
 STILL = 0.01  # m/s of commands that ask for nothing
 FOLLOWS = 0.5  # share of a commanded speed at which a vehicle moves

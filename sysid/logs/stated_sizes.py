@@ -14,8 +14,7 @@ from whill_mjx.vehicle.specs import VehicleSpec
 
 USUAL = 0.06  # share by which data sheets, worn tyres and creeping wheels make a size differ
 
-Gain = tuple[float, float]
-"""Outside motion over that of the odometry, and its standard error."""
+Gain = tuple[float, float]  # outside motion over that of the odometry, and its standard error
 
 
 def wrong_sizes(trials: Sequence[Trial], spec: VehicleSpec, reach: float) -> list[str]:

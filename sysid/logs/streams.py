@@ -27,16 +27,11 @@ class StreamQuality:
     """How regularly one stream was sampled."""
 
     samples: int
-    period: float
-    """Median interval [s]."""
-    jitter: float
-    """Half the spread of the middle 90 % of the intervals that are no gaps [s]."""
-    longest: float
-    """Longest interval [s]."""
-    gaps: int
-    """Intervals longer than GAP periods."""
-    missing: float
-    """Share of samples that the mean interval outside gaps promises and the stream lacks."""
+    period: float  # median interval [s]
+    jitter: float  # half the spread of the middle 90 % of the intervals that are no gaps [s]
+    longest: float  # longest interval [s]
+    gaps: int  # intervals longer than GAP periods
+    missing: float  # share of samples that the mean interval outside gaps promises and the stream lacks
     held: float
     """Share of samples that repeat the one before while the command moves: of the pose or of the speeds, whichever
     repeats more; nan for commands."""
@@ -126,14 +121,10 @@ def _moving(v: np.ndarray, omega: np.ndarray) -> np.ndarray:
 class Shift:
     """How much later a signal is than its reference."""
 
-    delay: float
-    """[s]; positive where the signal comes later."""
-    lag: float
-    """Time constant of the first-order response that fits best [s]; 0 where none was asked for."""
-    correlation: float
-    """Of the two signals at this shift; negative where one has the other's sign reversed."""
-    gain: float
-    """Signal over reference at this shift."""
+    delay: float  # [s]; positive where the signal comes later
+    lag: float  # time constant of the first-order response that fits best [s]; 0 where none was asked for
+    correlation: float  # of the two signals at this shift; negative where one has the other's sign reversed
+    gain: float  # signal over reference at this shift
 
 
 def find_shift(

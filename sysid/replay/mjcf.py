@@ -54,8 +54,7 @@ class Motion:
     qpos: jax.Array
     qvel: jax.Array
     act: jax.Array
-    warm: jax.Array
-    """Where the contact solver starts."""
+    warm: jax.Array  # where the contact solver starts
 
 
 def mjcf_model(

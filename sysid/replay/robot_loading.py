@@ -82,10 +82,8 @@ class _Draft:
 
     path: Path
     spec: Any
-    joints: tuple[str, ...]
-    """Of the driven wheels."""
-    stated: dict[str, float] | None
-    """Friction of links as a URDF states it for Gazebo; None for MJCF."""
+    joints: tuple[str, ...]  # of the driven wheels
+    stated: dict[str, float] | None  # friction of links as a URDF states it for Gazebo; None for MJCF
     notes: list[str]
     host: mujoco.MjModel = field(init=False)
     data: mujoco.MjData = field(init=False)
