@@ -13,7 +13,8 @@ from whill_mjx.vehicle.specs import VehicleSpec
 
 GYRO_SPACING = 0.05
 """Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
-CHECK = "Check the log: "  # begins a note on a fault of a log
+CHECK = "Check the log: "
+"""Begins a note on a fault of a log."""
 
 
 @dataclass(frozen=True)
@@ -97,29 +98,44 @@ class Start:
     yaw: float = 0.0
     v: float = 0.0
     omega: float = 0.0
-    position_sigma: float = 0.0  # standard error of x and y [m]
-    yaw_sigma: float = 0.0  # standard error of yaw [rad]
-    odometry_position_sigma: float = 0.0  # standard error of the origin from which the odometry counts x and y [m]
+    position_sigma: float = 0.0
+    """Standard error of x and y [m]."""
+    yaw_sigma: float = 0.0
+    """Standard error of yaw [rad]."""
+    odometry_position_sigma: float = 0.0
+    """Standard error of the origin from which the odometry counts x and y [m]."""
     odometry_yaw_sigma: float = 0.0
     """Standard error of the heading from which it counts yaw, and along which x points [rad]."""
-    measured: bool = False  # whether the pose is the outside measurement at t = 0 itself
-    rest: float = 0.0  # until when poses were averaged for it [s]
+    measured: bool = False
+    """Whether the pose is the outside measurement at t = 0 itself."""
+    rest: float = 0.0
+    """Until when poses were averaged for it [s]."""
 
 
 @dataclass(frozen=True)
 class Trial:
     """One drive (or one window of a longer one)."""
 
-    name: str  # of its folder, or of the window
-    manoeuvre: str  # trials of one manoeuvre with equal commands are replicates
-    command: Command  # commanded speed and yaw rate
-    odometry: OdometryStream | None  # what it reported; None where that was not logged
-    ground_truth: PoseStream | None  # its pose as measured from outside; None where that was not logged
-    start: Start  # pose and speed at t = 0
-    held_out: bool = False  # whether a fit must not look at it
-    group: str = ""  # terrain or robot; part of a selection
-    breaks: tuple[tuple[float, float], ...] = ()  # times between which the outside pose moved by an unknown amount [s]
-    gyro: GyroStream | None = None  # turn of the body by a yaw rate measured on the vehicle, counter-clockwise
+    name: str
+    """Of its folder, or of the window."""
+    manoeuvre: str
+    """Trials of one manoeuvre with equal commands are replicates."""
+    command: Command
+    """Commanded speed and yaw rate."""
+    odometry: OdometryStream | None
+    """What it reported; None where that was not logged."""
+    ground_truth: PoseStream | None
+    """Its pose as measured from outside; None where that was not logged."""
+    start: Start
+    """Pose and speed at t = 0."""
+    held_out: bool = False
+    """Whether a fit must not look at it."""
+    group: str = ""
+    """Terrain or robot; part of a selection."""
+    breaks: tuple[tuple[float, float], ...] = ()
+    """Times between which the outside pose moved by an unknown amount [s]."""
+    gyro: GyroStream | None = None
+    """Turn of the body by a yaw rate measured on the vehicle, counter-clockwise."""
 
     @property
     def duration(self) -> float:
@@ -145,12 +161,18 @@ def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:
 class Log:
     """All trials of one vehicle."""
 
-    name: str  # of its folder
-    spec: VehicleSpec  # nominal vehicle that was driven
-    trials: tuple[Trial, ...]  # all drives, training and held out
-    sha256: str  # over names and contents of its files
-    notes: tuple[str, ...] = ()  # what its reader found worth saying
-    fields: dict[str, Any] = field(default_factory=dict)  # content of dataset.toml
+    name: str
+    """Of its folder."""
+    spec: VehicleSpec
+    """Nominal vehicle that was driven."""
+    trials: tuple[Trial, ...]
+    """All drives, training and held out."""
+    sha256: str
+    """Over names and contents of its files."""
+    notes: tuple[str, ...] = ()
+    """What its reader found worth saying."""
+    fields: dict[str, Any] = field(default_factory=dict)
+    """Content of dataset.toml."""
 
     @property
     def training(self) -> tuple[Trial, ...]:
