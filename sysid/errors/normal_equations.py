@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import STEP, Space
+from sysid.errors.space import STEP, Space, huber_weight, robust_cost
 from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_processor
 from sysid.replay.records import Simulated

@@ -18,8 +18,7 @@ import numpy as np
 
 from sysid.errors.normal_equations import NormalEquations, make_equations, summed_there
 from sysid.errors.prior import Prior
-from sysid.errors.robust import huber_weight
-from sysid.errors.space import Residuals, Space
+from sysid.errors.space import Residuals, Space, huber_weight
 from sysid.logs.metrics import replicate_noise
 from sysid.logs.records import Trial
 from sysid.replay.arrays import added, namespace

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.errors.pose_objective import DriveResiduals
-from sysid.errors.robust import robust_cost
-from sysid.errors.space import Space
+from sysid.errors.space import Space, robust_cost
 from sysid.intervals.uncertainty import Uncertainty
 from sysid.search import least_squares
 from sysid.search.result import Progress

@@ -17,8 +17,7 @@ import numpy as np
 
 from sysid.errors.pose_objective import DriveResiduals, without_prior
 from sysid.errors.prior import UNKNOWN, expected_sd
-from sysid.errors.robust import HUBER, huber_weight, robust_cost
-from sysid.errors.space import BENT, NUISANCE, TERMS, Space
+from sysid.errors.space import BENT, HUBER, NUISANCE, TERMS, Space, huber_weight, robust_cost
 from sysid.intervals.independence import CONFIDENCE, Information, errors_of, shared_error
 from sysid.logs.metrics import replicate_groups
 from sysid.search import least_squares

@@ -9,13 +9,12 @@ import numpy as np
 
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.directions import UNLIKE
-from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
-from sysid.logs.standing import said, stood
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import pauses, time_faults, uncommanded
+from sysid.logs.unusable import LOST, lost, said, stood
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show

@@ -27,11 +27,10 @@ import numpy as np
 from sysid.logs.command_timeout import with_own_timeout
 from sysid.logs.gyro import told_sign, with_sign
 from sysid.logs.log import hash_files, load_log
-from sysid.logs.lost_pose import without_lost
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.sources import about
-from sysid.logs.standing import without_standing
 from sysid.logs.streams import without_held
+from sysid.logs.unusable import without_lost, without_standing
 from sysid.logs.windows import in_windows
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import ARRAY_BYTES, LONGEST_REASON, csv_rows, read_arrays, read_gzip, read_text
@@ -544,7 +543,7 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
              chained: bool = False) -> Log:
     """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials.
 
-    Training trials of DRIVE whose outside pose was lost are left out (`sysid.logs.lost_pose`), and so are a
+    Training trials of DRIVE whose outside pose was lost are left out (`sysid.logs.unusable`), and so are a
     dataset's rows that were held between updates (`sysid.logs.streams.without_held`). A base that stops by itself where
     no command comes does so in replays too (`sysid.logs.command_timeout`). A note says each.
     """

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sysid.errors.noise_level import said
+from sysid.errors.noise import said
 from sysid.follow_up import trust
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command

@@ -13,8 +13,7 @@ import numpy as np
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
 from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, Replays, estimate_noise
 from sysid.errors.prior import Prior, bounds_alone, make_prior
-from sysid.errors.robust import robust_cost
-from sysid.errors.space import Space, make_space, searched
+from sysid.errors.space import Space, make_space, robust_cost, searched
 from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Minimum, Profile, check_names, profile
 from sysid.logs import odometry_frames

@@ -14,8 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import Residuals, Space, is_delay
+from sysid.errors.space import Residuals, Space, huber_weight, is_delay, robust_cost
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try, normal_sums
 from sysid.search.result import FitResult, Progress
 from whill_mjx.io.steps import step

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import Residuals
+from sysid.errors.space import Residuals, huber_weight, robust_cost
 from sysid.search.gauss_newton import BoxStep, normal_sums
 from sysid.search.result import FitResult, Progress
 from whill_mjx.io.steps import step

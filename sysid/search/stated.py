@@ -16,8 +16,7 @@ import numpy as np
 
 from sysid.errors.pose_objective import DriveResiduals, Objective
 from sysid.errors.prior import expected_sd
-from sysid.errors.robust import HUBER
-from sysid.errors.space import Space
+from sysid.errors.space import HUBER, Space
 from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import PIECES, Uncertainty
 from sysid.search import least_squares
