@@ -1,4 +1,4 @@
-"""Which parameters are searched, between which bounds, and on which scale.
+"""Which parameters are searched, between which bounds and on which scale, and how much large residuals count.
 
 The search runs in unit coordinates u in [0, 1]: linear, or logarithmic where the range spans more than a factor of 10.
 """
@@ -236,9 +236,13 @@ def huber_weight(residual: Any) -> Any:
 
 def robust_cost(residual: Any, robust: Any) -> Any:
     """Sum (N,) of squares, or of the Huber loss, over residuals (N, B, K). `robust` may be traced."""
+    return robust_loss(residual, robust).sum((-1, -2))
+
+
+def robust_loss(residual: Any, robust: Any) -> Any:
+    """Squares of residuals, or their Huber losses; `robust` as of `robust_cost`."""
     xp = namespace(residual)
     if robust is False:
-        return xp.square(residual).sum((-1, -2))
+        return xp.square(residual)
     size = xp.abs(residual)
-    linear = (size > HUBER) & robust
-    return xp.where(linear, 2 * HUBER * size - HUBER**2, size**2).sum((-1, -2))
+    return xp.where((size > HUBER) & robust, 2 * HUBER * size - HUBER**2, size**2)

@@ -15,7 +15,7 @@ LARGEST = 1.25
 LEAST_TURN = 0.5  # root of the summed squares of the turns [rad] below which nothing turned
 
 
-def told_sign(turns: Sequence[tuple[float, float]]) -> float | None:
+def sign_shown(turns: Sequence[tuple[float, float]]) -> float | None:
     """1.0 or -1.0, by which a gyro's rate is multiplied to agree with the yaw seen otherwise; None where nothing
     shows.
 
@@ -38,7 +38,7 @@ def with_sign(trials: Sequence[Trial]) -> tuple[tuple[Trial, ...], list[str]]:
     turns = [each for trial in trials if (each := _turns(trial)) is not None]
     if not any(trial.gyro is not None for trial in trials):
         return tuple(trials), []
-    sign = told_sign(turns)
+    sign = sign_shown(turns)
     if sign is None:
         if float(np.linalg.norm([seen for _, seen in turns])) < LEAST_TURN:
             return tuple(trials), ["nothing turns enough to show the gyro's sign: it is taken as logged"]

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.command_timeout import with_own_timeout
-from sysid.logs.gyro import told_sign, with_sign
+from sysid.logs.gyro import sign_shown, with_sign
 from sysid.logs.log import hash_files, load_log
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.sources import about
@@ -199,7 +199,7 @@ def _drive_windows(path: Path, run: str, chained: bool
     wheel_v, wheel_omega = twist_from_wheels(spec, blocks["left_wheel_vel"], blocks["right_wheel_vel"])
     x, y, yaw = in_first_frame(blocks["icp_x"], blocks["icp_y"], blocks["icp_yaw"])
     gyro, count = blocks["imu_yaw"], len(x)
-    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
+    sign = sign_shown([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
     gyro *= sign or 1.0
     joints = _joints(x, y, yaw, wheel_v, gyro) if chained else None
     length = DRIVE_STEP_ROWS if chained else 1

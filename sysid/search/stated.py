@@ -16,7 +16,7 @@ import numpy as np
 
 from sysid.errors.pose_objective import DriveResiduals, Objective
 from sysid.errors.prior import expected_sd
-from sysid.errors.space import HUBER, Space
+from sysid.errors.space import Space, robust_loss
 from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import PIECES, Uncertainty
 from sysid.search import least_squares
@@ -152,7 +152,6 @@ def _errors(poses: Objective, points: np.ndarray, robust: bool) -> np.ndarray:
     for first in range(0, len(points), together):
         residual = poses.residuals(points[first : first + together])
         label = np.pad(piece, (0, residual.shape[2] - len(piece)))  # errors of the start belong to the first piece
-        large = np.abs(residual)
-        loss = np.where((large > HUBER) & robust, 2 * HUBER * large - HUBER**2, large**2)
+        loss = robust_loss(residual, robust)
         found.append(np.stack([loss[:, :, label == k].sum(-1) for k in range(PIECES)], axis=-1))
     return np.concatenate(found)
