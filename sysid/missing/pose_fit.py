@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from sysid.missing.evidence import with_values
 from sysid.replay.quotients import Quotients
 from sysid.replay.records import Measured, Simulated
 from sysid.search import least_squares
+from sysid.search.result import FitResult
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,10 @@ class PoseReplay:
         return Quotients.central(values, self.steps, -np.inf, np.inf).along(values, self.simulate)
 
 
+AGAIN = 5
+"""Searches that follow the first one, at most."""
+WORTH = 1e-3
+"""Share of the cost that such a search must gain for another one to follow."""
 POOLED = 1.0
 """Degrees of freedom that the noise of all replicates counts as, beside those of a manoeuvre's own."""
 
@@ -93,7 +98,26 @@ def fit_poses(
     elif noise.gyro is not None:
         noise = replace(noise, gyro=objective(start).residual_noise(start).gyro)
     starts = [start] if others is None else [start, *others]
-    fits = [least_squares.fit(objective(one), starts=one[None],
-                              stop=least_squares.Stopping(iterations)) for one in starts]
+    fits = [to_its_end(objective, one, iterations) for one in starts]
     best = min(fits, key=lambda fit: fit.cost)
     return best.u if best.cost < fits[0].initial_cost else None
+
+
+def to_its_end(objective: Callable[[np.ndarray], Objective], start: np.ndarray, iterations: int) -> FitResult:
+    """Searches of so many iterations at most, each from the end of the one before, until one gains nothing that counts.
+
+    Costs are jagged, so a search ends where its own steps happen to gain nothing, and rounding decides where. The next
+    one takes derivatives and damping anew; parameters that are searched by their logarithm have moved by then, and
+    their derivatives are taken over other steps.
+
+    Args:
+        objective: around unit coordinates (P,).
+    """
+    stop = least_squares.Stopping(iterations)
+    found = least_squares.fit(objective(start), starts=start[None], stop=stop)
+    for _ in range(AGAIN):
+        again = least_squares.fit(objective(found.u), starts=found.u[None], stop=stop)
+        gained, found = found.cost - again.cost, replace(again, initial_cost=found.initial_cost)
+        if gained < WORTH * found.cost:
+            break
+    return found
