@@ -187,10 +187,9 @@ def test_a_fit_to_poses_is_followed_until_another_search_gains_nothing():
 
     start = np.array([0.9, 0.1])
     one = least_squares.fit(Curved(), starts=start[None], stop=least_squares.Stopping(2))
-    found = to_its_end(objective, start, 2)
-    assert found.cost < 0.9 * one.cost and found.initial_cost == one.initial_cost
+    end = to_its_end(objective, start, 2)
     np.testing.assert_array_equal(begun[1], one.u)  # derivatives are taken around where the search before it ended
+    assert abs(end[0] - 0.4) < 0.05 < 0.15 < abs(one.u[0] - 0.4) and len(begun) > 3
     begun.clear()
-    rested = to_its_end(objective, found.u, 20)
-    last = to_its_end(objective, rested.u, 20)
-    assert last.cost == pytest.approx(rested.cost, rel=1e-3) and len(begun) <= 6
+    to_its_end(objective, end, 20)
+    assert len(begun) <= 2
