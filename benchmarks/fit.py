@@ -3,6 +3,7 @@
     python -m benchmarks.fit --shared ../shared --parts planted plant chair contact few speed drive mrclam
 
     python -m benchmarks.fit --parts coverage --part 3/32 --work runs/fit       # one of 32 processes; the same with
+    python -m benchmarks.fit --parts contact few --part 3/3 --work runs/fit     # these parts, and with
     python -m benchmarks.fit --parts starts tpe searches --part 3/40 --work runs/fit          # these parts; restart
     python -m benchmarks.fit --parts many_starts --work runs/fit                # any that was stopped. On a GPU
     python -m benchmarks.fit --parts coverage starts tpe searches many_starts --collect --work runs/fit  # the figures
@@ -88,18 +89,25 @@ def days(settings: Benchmark, name: str, trials: set[str] | None = None) -> None
     """Held-out error of fits to days of the contact plant, over replicates; of these trials only, if they are given."""
     from benchmarks.plant.make import Experiment, make_log
 
-    ratios, seconds = [], []
-    for seed in settings.seeds:
+    def job(seed: str) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
-            make_log(Path(folder) / "log", Experiment(seed=seed))
+            make_log(Path(folder) / "log", Experiment(seed=int(seed)))
             log = load_log(Path(folder) / "log").select(lambda one: trials is None or one.name in trials)
         fit = fit_log(log, settings.fitted())
-        ratios.append(against_replicates(fit, log, name)[1]["value"])
-        seconds.append(fit.seconds)
-        print(f"day {seed}: {ratios[-1]:.3f}; as stated: {', '.join(fit.stated) or 'nothing'}", flush=True)
-        figures = {f"{name}_replicate_ratio{settings.tag}": figure(ratios, "-"),
-                   f"seconds_{name}{settings.tag}": figure(seconds, "s")}
-        record("fit", CLAIM, figures)  # of the days so far
+        return {"ratio": against_replicates(fit, log, name)[1]["value"], "seconds": fit.seconds,
+                "as_stated": list(fit.stated)}
+
+    folder = settings.work / f"{name}{settings.tag}"
+    if not settings.collect:
+        run_jobs(folder, labels_of(settings.part, [str(seed) for seed in settings.seeds]), job)
+    results = [one for one in read_results(folder) if int(one["label"]) in settings.seeds]
+    for one in results:
+        print(f"day {one['label']}: {one['ratio']:.3f}; as stated: {', '.join(one['as_stated']) or 'nothing'}")
+    if len(results) == len(settings.seeds):
+        ratios, seconds = ([one[of] for one in results] for of in ("ratio", "seconds"))
+        figures = on_device({f"{name}_replicate_ratio{settings.tag}": figure(ratios, "-"),
+                             f"seconds_{name}{settings.tag}": figure(seconds, "s")}, results)
+        record("fit", CLAIM, figures)
         show(figures)
 
 

@@ -75,6 +75,9 @@ class Benchmark:
     vehicle: Literal["chair", "scooter", "robot"] = "chair"
     """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own. `speed` and `classes`
     are of the chair."""
+    draw: Annotated[int, NOT_NEGATIVE] = 0
+    """Another draw of all that is driven: other seeds, reference days and pairs. Each needs a `work` of its own; the
+    names of its verdicts have its number, so those of several draws can be collected from one folder."""
     pairs: Annotated[int, NOT_NEGATIVE] = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False
@@ -82,7 +85,7 @@ class Benchmark:
     only: tuple[str, ...] = ()
     """Only logs with these effects, of those from `base` and `scales`."""
     labels: tuple[str, ...] = ()
-    """Only logs of these names, in this order, of all that the other options ask for."""
+    """Only logs of these names (without the number of a draw), in this order, of all that the other options ask for."""
     full: Annotated[int, COUNT] = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -108,7 +111,7 @@ class Benchmark:
     @property
     def driven(self) -> Driven:
         """What drives the logs."""
-        return Driven(self.noise, self.vehicle)
+        return Driven(self.noise, self.vehicle, self.draw)
 
 
 def main(settings: Benchmark) -> None:
@@ -197,7 +200,8 @@ def wanted(settings: Benchmark) -> list[contact.Job]:
         listed += contact.left_out_jobs(work, part)
     listed += contact.pair_jobs(work, settings.pairs, part, driven)
     by_name = {job.label: job for job in listed}
-    return [by_name[label] for label in settings.labels if label in by_name] if settings.labels else listed
+    chosen = [by_name[label] for label in settings.labels if label in by_name] if settings.labels else listed
+    return [replace(job, label=driven.label(job.label), log=driven.label(job.log)) for job in chosen]
 
 
 def look_alikes(settings: Benchmark) -> None:

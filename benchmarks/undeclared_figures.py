@@ -160,12 +160,12 @@ def of_noisy_nulls(nulls: Sequence[dict[str, Any]], tag: str, level: str) -> dic
 
 def sets_of(nulls: Sequence[dict[str, Any]]) -> int:
     """How many sets of reference days these logs are judged against."""
-    return len({one.get("reference", 0) for one in nulls})
+    return len({(one.get("draw", 0), one.get("reference", 0)) for one in nulls})
 
 
 def calibrates(null: dict[str, Any]) -> bool:
     """Whether a log with nothing in it is for calibrating p-values; the others show whether they are uniform."""
-    return null.get("reference", 0) % 2 == 0
+    return not null.get("draw", 0) and null.get("reference", 0) % 2 == 0
 
 
 def calibrate(work: Path) -> None:

@@ -33,6 +33,7 @@ from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, resolve, turning_inertia, write_mjcf
+from sysid.replay.robot_rest import FALLS
 from sysid.replay.robot_sizes import SIZES, Size, sizes_of
 from sysid.replay.robot_vehicle import vehicle_of
 from sysid.replay.rollout import quaternion_product
@@ -85,6 +86,8 @@ def mjcf_model(
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
     """
     robot = load_robot(Path(path), wheels, wheel_radius, track, timestep, regulated=calibrate)
+    if robot.falls:
+        raise ValueError(f"{path}: {FALLS}.")
     host = robot.host
     bounds, entries = _searched(robot, parameters, calibrate)
     # A mass scales its inertia: before an inertia is set by itself.

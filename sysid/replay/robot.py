@@ -50,6 +50,8 @@ class Robot:
     """Inertia of a driven wheel, motor included [kg m^2]."""
     load: float = 0.0
     """Inertia that it speeds up, its share of the vehicle's included [kg m^2]."""
+    falls: bool = False
+    """Whether it falls over while nothing drives it, as a robot that balances does."""
 
     @property
     def joints(self) -> tuple[int, ...]:

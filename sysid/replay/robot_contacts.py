@@ -145,8 +145,7 @@ def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
 
     Wheels roll on the middle of their width, as spheres: a stiff cylinder stands on its two edges, scrubs in every turn
     and turns as if the outer edges were its track. Parts of one robot do not touch each other. Joints with an end, of
-    arms, heads and suspensions, are held: their motors and springs are not in the file. A driven wheel is held at its
-    speed, whatever its bearing.
+    arms, heads and suspensions, are held: their motors and springs are not in the file.
     """
     notes = []
     driven = {joint.parent.name for joint in spec.joints if joint.name in joints}
@@ -160,12 +159,8 @@ def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
             geom.solref, geom.solimp, geom.solmix = FIRM_TIME, FIRM, ALONE
     for joint in list(spec.joints):
         if joint.name in joints:
-            if np.any(joint.frictionloss) or np.any(joint.damping):
-                notes.append(f"{path.name}: friction and damping of joint {joint.name} are left out: an added servo "
-                             "would make up for them")
-            joint.frictionloss = 0.0
-            joint.damping = np.zeros_like(joint.damping)
-        elif joint.type == mujoco.mjtJoint.mjJNT_SLIDE or (
+            continue
+        if joint.type == mujoco.mjtJoint.mjJNT_SLIDE or (
                 joint.type == mujoco.mjtJoint.mjJNT_HINGE and np.ptp(joint.range)):
             notes.append(f"{path.name}: joint {joint.name} is held at 0: the file has no motor or spring for it")
             spec.delete(joint)
@@ -173,7 +168,8 @@ def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
 
 
 def leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
-    """Exclude contacts that MJX lacks between parts of one robot, a note for each; ValueError for others."""
+    """Exclude contacts that MJX lacks between parts of one robot, and those of obstacles, a note for each; ValueError
+    for others."""
     import_mjx()
     from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
 
@@ -186,12 +182,26 @@ def leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str
         geoms = " and ".join(f"geom {host.geom(int(geom)).name or geom!r} ({shape})"
                              for geom, shape in zip((one, other), shapes, strict=True))
         bodies = [int(host.geom_bodyid[geom]) for geom in (one, other)]
+        if declared < 0 and 0 in bodies and not _under(host, obstacle := int((one, other)[bodies.index(0)]), bodies):
+            spec.geom(host.geom(obstacle).name).contype = spec.geom(host.geom(obstacle).name).conaffinity = 0
+            left_out[("", host.geom(obstacle).name)] = (
+                f"{path.name}: MJX has no contact between {geoms}; the obstacle's contacts are left out")
+            continue
         if declared >= 0 or 0 in bodies or host.body_rootid[bodies[0]] != host.body_rootid[bodies[1]]:
             raise ValueError(f"{path}: MJX has no contact between {geoms}. Replace one by a sphere, capsule or box, or "
                              "let their contype and conaffinity keep them apart.")
         names = sorted(host.body(body).name for body in bodies)
         left_out.setdefault((names[0], names[1]), f"{path.name}: MJX has no contact between {geoms}; contacts between "
                             f"their bodies {names[0]} and {names[1]} are left out")
-    for first, second in left_out:
+    for first, second in filter(lambda names: names[0], left_out):
         spec.add_exclude(name=f"{first}_{second}_left_out", bodyname1=first, bodyname2=second)
     return tuple(left_out.values())
+
+
+def _under(host: mujoco.MjModel, ground: int, bodies: Sequence[int]) -> bool:
+    """Whether a geom of the world reaches under a robot of these bodies where it starts."""
+    data = mujoco.MjData(host)
+    mujoco.mj_kinematics(host, data)
+    root = max(int(host.body_rootid[body]) for body in bodies)
+    place = (data.xpos[root] - data.geom_xpos[ground]) @ data.geom_xmat[ground].reshape(3, 3)
+    return bool((np.abs(place - host.geom_aabb[ground, :3])[:2] < host.geom_aabb[ground, 3:5]).all())

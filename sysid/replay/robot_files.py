@@ -10,6 +10,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import mujoco
 import numpy as np
 
 from sysid.replay import xacro_text
+from sysid.replay.stated_drive import StatedDrive, stated_drive
 from sysid.replay.urdf_links import compiler_of, complete_links
 from sysid.replay.xacro_text import around, package_folders
 from whill_mjx.io.reading import LONGEST_REASON, MB, decoded, read_bytes
@@ -34,11 +36,22 @@ mujoco.set_mju_user_warning(lambda text: None)
 """What is wrong in a model is raised; MuJoCo's own handler writes MUJOCO_LOG.TXT where the command was called."""
 
 
-def read_robot(
-    path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None,
-) -> tuple[Any, list[str], dict[str, float] | None]:  # fmt: skip
-    """The editable model of an MJCF, URDF or xacro file, a note for each mesh that was replaced, and the friction that
-    a URDF states for Gazebo by link; None for MJCF, which has its own.
+@dataclass(frozen=True)
+class RobotFile:
+    """What was read."""
+
+    spec: Any
+    """The editable mujoco.MjSpec."""
+    notes: list[str]
+    """On what was replaced or left out."""
+    friction: dict[str, float] | None = None
+    """Of links, as a URDF states it for Gazebo; None for MJCF, which has its own."""
+    drive: StatedDrive = StatedDrive()
+    """Joints that it says are driven."""
+
+
+def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None) -> RobotFile:
+    """The editable model of an MJCF, URDF or xacro file.
 
     Raises:
         FileNotFoundError, ValueError: naming the file, the rule and the remedy.
@@ -51,14 +64,16 @@ def read_robot(
     except ElementTree.ParseError:
         if path.suffix not in ROBOT_FILES:
             raise ValueError(f"{path}: {OTHER}") from None
-        return mujoco.MjSpec.from_file(str(path)), [], None  # MuJoCo says where the mistake is
+        return RobotFile(mujoco.MjSpec.from_file(str(path)), [])  # MuJoCo says where the mistake is
     if top.tag not in ("robot", "mujoco"):
         raise ValueError(f"{path}: it begins with <{top.tag[:40]}>. {OTHER}")
     if top.tag != "robot":
         spec = mujoco.MjSpec.from_string(text) if xacro else mujoco.MjSpec.from_file(str(path))
-        return spec, [*left_out, *_place_meshes(path, spec)], None
+        return RobotFile(spec, [*left_out, *_place_meshes(path, spec)])
+    drive = stated_drive(top)
     notes = [*left_out, *complete_links(path, top), *_place_urdf_meshes(path, top, wheels, wheel_radius)]
-    return mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode")), notes, _frictions(top)
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode"))
+    return RobotFile(spec, notes, _frictions(top), drive)
 
 
 def _frictions(top: ElementTree.Element) -> dict[str, float]:

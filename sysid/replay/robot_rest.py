@@ -12,6 +12,11 @@ import numpy as np
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
 UPRIGHT = 0.9  # cosine of the angle between a hinge and the vertical, at least, of a caster's swivel
+FALLEN = 0.8  # cosine of the angle by which a vehicle tilts when it lies on its body
+PUSH, WAIT = 0.3, 3.0  # rad/s of a push about the axle, and s after it
+FALLS = ("it stands on its two driven wheels alone and falls over: the file has no caster, or the robot balances by a "
+         "controller of its own, which is not in the file. Add the caster, or fit a function of your own "
+         "(docs/models.md)")
 NEAR = 0.05  # of the wheel radius above the floor, within which a support may touch it in a drive
 LEVEL = 0.01  # of its distance from the axle by which a support is raised where others stand on the other side
 
@@ -34,6 +39,29 @@ def settle(path: Path, host: mujoco.MjModel, data: Any, speed: int, wheels: Sequ
     if fastest > REST_SPEED:
         raise ValueError(f"{path}: after {SETTLE:g} s on its floor, without a command, the model still moves at "
                          f"{fastest:.3g} m/s (at most {REST_SPEED:g}): it falls, rolls away or shakes. {remedy}")
+
+
+def falls(host: mujoco.MjModel, rest: np.ndarray, speed: int, root: int, axle: np.ndarray) -> bool:
+    """Whether a vehicle falls over after a push forwards or backwards, without a command.
+
+    Args:
+        rest: qpos at rest.
+        speed: address of the free joint in qvel.
+        root: body that moves freely.
+        axle: (3,) axis of its driven wheels in its own frame.
+    """
+    data = mujoco.MjData(host)
+    for push in (PUSH, -PUSH):
+        mujoco.mj_resetData(host, data)
+        data.qpos[:] = rest
+        mujoco.mj_kinematics(host, data)
+        upright = data.xmat[root].reshape(3, 3).T @ [0.0, 0.0, 1.0]  # in its own frame, at rest
+        data.qvel[speed + 3 : speed + 6] = push * axle
+        for _ in range(round(WAIT / host.opt.timestep)):
+            mujoco.mj_step(host, data)
+            if data.xmat[root].reshape(3, 3)[2] @ upright < FALLEN:
+                return True
+    return False
 
 
 def sliding(host: mujoco.MjModel, data: mujoco.MjData, root: int, swivelling: bool = False) -> tuple[int, ...]:
