@@ -247,7 +247,8 @@ class Objective:
         if self._rates is None or simulated.gyro is None:
             return None
         error = np.abs(np.diff(np.asarray(simulated.gyro[0]) - self.measured.gyro, axis=1) * self._rates[0])
-        known = error[self._rates[1] > 0]
+        there = self._rates[1] > 0
+        known = error[there] / self._rates[1][there]  # whatever the drives weigh
         return max(1.4826 * float(np.median(known)), MIN_NOISE) if len(known) else self.noise.gyro
 
     def bad(self, simulated: Simulated) -> Any:
