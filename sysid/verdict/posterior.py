@@ -83,7 +83,7 @@ class TriedSet:
     own: tuple[float, ...]
     """By how much each effect lowers the cost beside other forms of the others."""
     foretold: tuple[float, ...]
-    """Lower 95 % end of what each effect so gains on manoeuvres, with all sizes fitted to the other manoeuvres."""
+    """Lower 95 % end of how much each effect so raises the log density of manoeuvres that the others predict."""
     bent: Left
     """What is left where all may have other forms."""
     classes: tuple[tuple[str, ...], ...]
