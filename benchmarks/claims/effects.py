@@ -97,7 +97,8 @@ CLAIMS = (
         MISSING,
         "False alarms and other checks of the verdict",
         "undeclared",
-        "The same logs. Fresh ones are of the present decision. The weights were chosen with the others in view. "
+        "The same logs. Fresh ones are judged by the present decision, from evidence kept before its last change. The "
+        "weights were chosen with the others in view. "
         "Effects taken out of the catalogue are of an earlier decision.",
         ("figure", "value"),
         (
