@@ -7,10 +7,12 @@
     for i in $(seq 28); do python -m benchmarks.undeclared --scales 2 4 --seeds 4 --pairs 90 --share & done; wait
     for i in $(seq 16); do python -m benchmarks.undeclared --sensor-noise 0.5 2 4 --share & done; wait
     python -m benchmarks.undeclared --collect
+    python -m benchmarks.undeclared --draw 1 --nulls 8 --scales 2 4 --pairs 8
 
 The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the others do so in processes
 that share a folder, each with a part of its own or with whatever is left. Verdicts are kept in `runs/undeclared` and a
-run that was stopped goes on where it was; the figures are written at the end from all verdicts there.
+run that was stopped goes on where it was; the figures are written at the end from all verdicts there. The last form
+drives logs that no record has used.
 """
 
 from __future__ import annotations
@@ -77,7 +79,8 @@ class Benchmark:
     are of the chair."""
     draw: Annotated[int, NOT_NEGATIVE] = 0
     """Another draw of all that is driven: other seeds, reference days and pairs. Each needs a `work` of its own; the
-    names of its verdicts have its number, so those of several draws can be collected from one folder."""
+    names of its verdicts have its number, so those of several draws can be collected from one folder. Their figures
+    end in `_fresh`: the weights of the decision were chosen with draw 0 in view."""
     pairs: Annotated[int, NOT_NEGATIVE] = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False

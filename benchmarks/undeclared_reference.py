@@ -50,9 +50,10 @@ class Driven:
 
     @property
     def tag(self) -> str:
-        """What the names of its figures end in."""
+        """What the names of its figures end in. Draws that the weights were not chosen with have them in common."""
         noise = "" if self.noise == 1.0 else f"_noise_{self.noise:g}"
-        return noise if self.vehicle == "chair" else f"{noise}_{self.vehicle}"
+        vehicle = "" if self.vehicle == "chair" else f"_{self.vehicle}"
+        return f"{noise}{vehicle}{'_fresh' if self.draw else ''}"
 
 
 PER_DRAW = 10_000_000

@@ -55,10 +55,10 @@ def _outcome(findings: Findings, priors: Thresholds, judged: Posterior, number: 
         return "contradicted"
     if len(one.effects) > MOST:
         return "tried to check the others"
-    if max(one.p) >= priors.alpha:
-        return "may be another form of the other" if len(one.effects) > 1 else "may be chance"
     if not findings.able(one, priors):
-        return "is wrong about other manoeuvres" if min(one.foretold) <= 0 < len(one.effects) - 1 else "adds too little"
+        if len(one.effects) == 1:
+            return "adds too little"
+        return "is wrong about other manoeuvres" if min(one.foretold) <= 0 else "may be another form of the other"
     if judged.verdict == "none":
         return "no more than days differ by"
     if number != judged.chosen:

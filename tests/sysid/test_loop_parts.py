@@ -142,6 +142,13 @@ def test_nothing_is_missing_unless_nothing_has_hardly_any_weight(gain, excess, s
     assert sum(found.weights.values()) == pytest.approx(1.0)
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("effects", [("quadratic_drag",), ("quadratic_drag", "slope")])
+def test_p_values_of_effects_decide_nothing(effects):
+    small, large = (posterior(findings(0.0, [tried(0.0, p, effects, gain=60.0)]), Thresholds()) for p in (1e-6, 0.5))
+    assert small == large and small.verdict == "named"
+
+
 def base_fit(excess):
     """A fit without effects that leaves so much above the noise, of a single sample."""
     residual = np.full((1, 1), np.sqrt(1 + excess))
