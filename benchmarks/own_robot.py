@@ -109,10 +109,13 @@ def ready_robot(config: Benchmark, loop: LoopConfig) -> tuple[Prepared, VehicleS
             print(f"fitted, {time.perf_counter() - began:.0f} s", flush=True)
         spec, vehicle = load_fitted(fitted)
         days = [of_file(day, spec, str(fitted)) for day in days]
-        if not made.exists():
-            write_whole(made, kept.dumps(reference_for(days[0], days, loop, replace(vehicle, kept=False))))
+        try:
+            reference = kept.loads(made.read_bytes())
+        except (FileNotFoundError, kept.KeptError):
+            reference = reference_for(days[0], days, loop, replace(vehicle, kept=False))
+            write_whole(made, kept.dumps(reference))
             print(f"reference, {time.perf_counter() - began:.0f} s", flush=True)
-    ready = prepare(kept.loads(made.read_bytes()), days[0].spec, loop)
+    ready = prepare(reference, days[0].spec, loop)
     print(f"ready, {time.perf_counter() - began:.0f} s", flush=True)
     return ready, spec, fitted
 

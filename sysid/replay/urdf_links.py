@@ -23,6 +23,7 @@ def complete_links(path: Path, top: ElementTree.Element) -> list[str]:
     Where no link has a shape that touches, and on wheels and casters without one, the visible shape does. A mass of
     zero is left out, so that the shape gives it. Impossible moments of inertia become those of a ball, or are balanced.
     """
+    _check_tree(path, top)
     notes = [*_held_parts(path, top), *_couplings(path, top)]
     turning = {child.get("link") for joint in top.iter("joint") if joint.get("type") == "continuous"
                and (child := joint.find("child")) is not None}
@@ -38,6 +39,22 @@ def complete_links(path: Path, top: ElementTree.Element) -> list[str]:
         notes += [f"{path.name}: {one}" for one in _inertial(link, name)]
     compiler_of(top).set("balanceinertia", "true")
     return notes
+
+
+def _check_tree(path: Path, top: ElementTree.Element) -> None:
+    """Raise ValueError where links and joints have one name twice, or a joint hangs on a link that is not there."""
+    for kind in ("link", "joint"):
+        names = [one.get("name", "") for one in top.iterfind(kind)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"{path}: {kind} {twice[0]!r} is there twice. Give one of them another name.")
+    links = {one.get("name") for one in top.iterfind("link")}
+    for joint in top.iterfind("joint"):
+        for end in ("parent", "child"):
+            found = joint.find(end)
+            name = None if found is None else found.get("link")
+            if name not in links:
+                raise ValueError(f"{path}: {end} of joint {joint.get('name')!r} is link {name!r}, which the file lacks."
+                                 " Correct the name, or add the link.")
 
 
 def _held_parts(path: Path, top: ElementTree.Element) -> list[str]:

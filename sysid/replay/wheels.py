@@ -69,6 +69,10 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDri
                          "a URDF, hinge in MJCF. Tracks that slide along a robot are not read.")
     if standing is None:
         spec.copy().compile()  # MuJoCo says where the mistake is
+    if not any(map(_may_roll, hinges.values())):
+        raise ValueError(f"{path}: all joints end within a turn ({', '.join(hinges)}), as on a robot with legs or an "
+                         "arm: it has no wheels. Joints of wheels are of type continuous in a URDF, without a range in "
+                         "MJCF.")
     raise ValueError(f"{path}: the names do not show which wheels are driven (joints: {', '.join(hinges)}). Name "
                      "them: wheels=(left, right), on the command line --wheels LEFT RIGHT, or all four, six or more.")
 

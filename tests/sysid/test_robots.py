@@ -482,6 +482,17 @@ def test_a_track_of_many_wheels_drives_as_one_side(tmp_path):
     assert len(robot.wheels) == 10 and drives(robot)[0]
 
 
+@pytest.mark.parametrize(("parts", "said"), [
+    ([*ROLLING, link("port_link")], "link 'port_link' is there twice"),
+    ([joint("left_wheel", "nowhere", "0 0 0", "continuous")], "child of joint 'left_wheel' is link 'nowhere', which"),
+    ([link(f"foot_{k}") + joint(f"knee_{k}", f"foot_{k}", f"0 {k} 0", "revolute", more=(
+        '<limit lower="-1" upper="1" effort="9" velocity="9"/>')) for k in (-1, 1)], "all joints end within a turn"),
+])  # fmt: skip
+def test_a_file_that_is_no_robot_on_wheels_says_why(tmp_path, parts, said):
+    with pytest.raises(ValueError, match=said):
+        load_robot(robot_file(tmp_path, *parts))
+
+
 def test_a_robots_own_name_shows_no_side(tmp_path):
     robot = load_robot(robot_file(tmp_path, wheel("r1_wheel_r", 0, -0.2), wheel("r1_wheel_l", 0, 0.2)))
     assert [robot.host.actuator(one).name for one in robot.actuators] == ["r1_wheel_l", "r1_wheel_r"]
