@@ -44,7 +44,7 @@ from sysid.logs.log import load_log
 from sysid.logs.metrics import noise_floor
 from sysid.logs.records import Log
 from sysid.search.comparison import Judge
-from sysid.search.fitting import Fit, fit_log, fitted_plant, make_objective, make_problem
+from sysid.search.fitting import Fit, fit_log, make_objective, make_problem
 from sysid.search.settings import FitConfig
 from whill_mjx.io.command_line import run
 
@@ -124,8 +124,8 @@ def days(settings: Benchmark, name: str, trials: set[str] | None = None) -> None
 
 def planted(settings: Benchmark) -> None:
     """Planted truth of the same model: held-out error against the sensor noise, and starts that agree."""
+    from benchmarks.planted_logs import Schedule, fitted_plant, write_dataset
     from sysid.errors.space import make_space
-    from sysid.logs.synthetic import Schedule, write_dataset
     from whill_mjx.vehicle.parameters import get_values, set_values
     from whill_mjx.vehicle.presets import preset_params
     from whill_mjx.vehicle.specs import WHILL_CR

@@ -26,16 +26,11 @@ LIGHT = 0.02  # share of the weight below which what touches the floor is not li
 class Check:
     """A robot at rest and in two drives of `SECONDS`."""
 
-    loads: dict[str, float]
-    """Share of the weight that each geom on the floor carries."""
-    command: tuple[float, float]
-    """Speed [m/s] and yaw rate [rad/s] that were asked for, one drive each."""
-    speed: float
-    """Along the vehicle where it should drive straight [m/s]."""
-    drift: float
-    """Yaw rate there [rad/s]."""
-    rate: float
-    """Yaw rate where it should turn on the spot [rad/s]."""
+    loads: dict[str, float]  # share of the weight that each geom on the floor carries
+    command: tuple[float, float]  # speed [m/s] and yaw rate [rad/s] that were asked for, one drive each
+    speed: float  # along the vehicle where it should drive straight [m/s]
+    drift: float  # yaw rate there [rad/s]
+    rate: float  # yaw rate where it should turn on the spot [rad/s]
 
     @property
     def drives_straight(self) -> bool:

@@ -35,8 +35,7 @@ def touches_ground(host: mujoco.MjModel, geom: int) -> bool:
 
 
 def radius_of(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
-    """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round; else how far its
-    shapes reach."""
+    """Radius of the largest round geom of a wheel that may touch the ground; else how far its shapes reach."""
     round_ones = [int(one) for one in parts(host, body) if int(host.geom_type[one]) in map(int, ROUND)]
     touching = [one for one in round_ones if touches_ground(host, one)]
     sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
@@ -71,8 +70,8 @@ def reach_of(host: mujoco.MjModel, body: int) -> float:
 
 
 def _corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Points (K, 3) of a geom in its own frame: vertices of a mesh, corners of a box, the middle of a ball, the surface
-    of an ellipsoid."""
+    """Points (K, 3) of a geom in its frame: a mesh's vertices, a box's corners, a ball's middle, an ellipsoid's
+    surface."""
     kind, mesh = int(host.geom_type[geom]), int(host.geom_dataid[geom])
     if kind == int(mujoco.mjtGeom.mjGEOM_MESH):
         first = int(host.mesh_vertadr[mesh])
@@ -120,8 +119,7 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
 def below_wheels(
     path: Path, host: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int], radius: float,
 ) -> dict[str, str]:  # fmt: skip
-    """Geoms that reach so far below the driven wheels that these would hang in the air, with a note for each: mostly
-    boxes that stand in for meshes."""
+    """Geoms that reach so far below the driven wheels that these would hang in the air; a note for each."""
     floor = min(float(data.xpos[body, 2]) for body in bodies) - radius
     wheels = {int(host.body_weldid[body]) for body in bodies}
     found = {}
@@ -143,9 +141,9 @@ def below_wheels(
 def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
     """What a URDF leaves to its simulator, a note for each change.
 
-    Wheels roll on the middle of their width, as spheres: a stiff cylinder stands on its two edges, scrubs in every turn
-    and turns as if the outer edges were its track. Parts of one robot do not touch each other. Joints with an end, of
-    arms, heads and suspensions, are held: their motors and springs are not in the file.
+    Wheels roll on the middle of their width, as spheres: a stiff cylinder stands on its two edges and scrubs in every
+    turn. Parts of one robot do not touch each other. Joints with an end are held: their motors and springs are not in
+    the file.
     """
     notes = []
     driven = {joint.parent.name for joint in spec.joints if joint.name in joints}
@@ -168,8 +166,7 @@ def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
 
 
 def leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
-    """Exclude contacts that MJX lacks between parts of one robot, and those of obstacles, a note for each; ValueError
-    for others."""
+    """Exclude contacts that MJX lacks, of parts of one robot and of obstacles, with notes; ValueError for others."""
     import_mjx()
     from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
 

@@ -40,22 +40,15 @@ mujoco.set_mju_user_warning(lambda text: None)
 class RobotFile:
     """What was read."""
 
-    spec: Any
-    """The editable mujoco.MjSpec."""
-    notes: list[str]
-    """On what was replaced or left out."""
+    spec: Any  # the editable mujoco.MjSpec
+    notes: list[str]  # on what was replaced or left out
     friction: dict[str, float] | None = None
     """Of links, as a URDF states it for Gazebo; None for MJCF, which has its own."""
-    drive: StatedDrive = StatedDrive()
-    """Joints that it says are driven."""
+    drive: StatedDrive = StatedDrive()  # joints that it says are driven
 
 
 def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None) -> RobotFile:
-    """The editable model of an MJCF, URDF or xacro file.
-
-    Raises:
-        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
-    """
+    """The editable model of an MJCF, URDF or xacro file; FileNotFoundError or ValueError where it is none."""
     text = decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF, URDF or xacro file."))
     xacro = path.suffix == ".xacro" or "<xacro:" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     text, left_out = expand_xacro(path) if xacro else (text, [])
@@ -89,10 +82,7 @@ def _frictions(top: ElementTree.Element) -> dict[str, float]:
 
 
 def expand_xacro(path: Path) -> tuple[str, list[str]]:
-    """Text of a xacro file with all macros expanded, and a note on each file of another package that is missing.
-
-    A process of its own does it: what stands in the file may never end.
-    """
+    """Text of a xacro file with all macros expanded, by a process that may be stopped, and notes on missing files."""
     if importlib.util.find_spec("xacro") is None:
         raise ValueError(f"{path}: xacro files need the package xacro. Install it: {XACRO}; or expand the file where "
                          "you have ROS: xacro FILE > robot.urdf.")
@@ -115,11 +105,9 @@ def expand_xacro(path: Path) -> tuple[str, list[str]]:
 
 
 def find_mesh(folder: Path, name: str) -> Path | None:
-    """The file of a mesh that MuJoCo can read, or None.
+    """The file beside a robot file's folder of a mesh that MuJoCo can read, or None.
 
-    Args:
-        folder: of the robot file.
-        name: as in it: package://PACKAGE/PATH, model://..., file://PATH, an absolute or a relative path.
+    `name`: package://PACKAGE/PATH, model://..., file://PATH, an absolute or a relative path.
     """
     scheme, _, rest = name.partition("://") if "://" in name else ("", "", name)
     rest = rest.replace("\\", "/")

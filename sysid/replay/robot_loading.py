@@ -68,11 +68,12 @@ def load_robot(
     root, speed, turning = int(host.jnt_qposadr[free]), int(host.jnt_dofadr[free]), host.jnt_dofadr[ids].tolist()
     supports = _rest(draft, speed, turning, radius)
     inertias = [wheel_inertias(host, one, radius, len(ids)) for one in ids]
+    spin, load = (float(one) for one in np.mean(inertias, axis=0))
     return Robot(path, draft.spec, host, root, speed, tuple(turning), actuators, sign,
                  are_motors(path, host, actuators), drive_gain(host, actuators, inertias), rotation.T @ middle,
                  rotation.T @ np.cross(left, [0.0, 0.0, 1.0]), radius, distance if track is None else track,
                  data.qpos.copy(), tuple(actuators[one] for one in bare), supports, distance, tuple(draft.notes),
-                 integrals(host, ids), *(float(one) for one in np.mean(inertias, axis=0)),
+                 integrals(host, ids), spin, load,
                  falls=len(ids) == 2 and falls(host, data.qpos.copy(), speed, body, rotation.T @ left))
 
 
@@ -82,10 +83,8 @@ class _Draft:
 
     path: Path
     spec: Any
-    joints: tuple[str, ...]
-    """Of the driven wheels."""
-    stated: dict[str, float] | None
-    """Friction of links as a URDF states it for Gazebo; None for MJCF."""
+    joints: tuple[str, ...]  # of the driven wheels
+    stated: dict[str, float] | None  # friction of links as a URDF states it for Gazebo; None for MJCF
     notes: list[str]
     host: mujoco.MjModel = field(init=False)
     data: mujoco.MjData = field(init=False)

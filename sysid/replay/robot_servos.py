@@ -31,8 +31,7 @@ def wheel_inertias(host: mujoco.MjModel, joint: int, radius: float, count: int) 
 
 
 def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
-    """Remove actuators of the wheels that take neither a torque nor a speed, and those on tendons, a note for each.
-    Sensors of what is removed go with it."""
+    """Remove the wheels' actuators that take neither torque nor speed or are on tendons, and sensors; with notes."""
     notes = []
     turned = {one.name for one in spec.tendons if any(wrap.target is not None and wrap.target.name in joints
                                                       for wrap in one.path)}
@@ -69,9 +68,9 @@ def add_servos(
 ) -> tuple[list[int], list[str]]:  # fmt: skip
     """Give velocity servos to wheels without actuators; numbers of these wheels, and a note on each bearing left out.
 
-    Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
-    vehicles follow within the same time. MuJoCo softens a contact with the inverse inertia of what touches: a wheel
-    without a motor's rotor would creep. A bearing's friction and damping would hold a servo below its target.
+    Gains follow from the inertia that a wheel has to speed up, so that all vehicles follow within the same time. A
+    contact is softened by the inverse inertia of what touches: a wheel without a rotor would creep. A bearing's
+    friction and damping would hold a servo below its target.
     """
     bare, notes = [k for k, joint in enumerate(joints) if not any(one.target == joint for one in spec.actuators)], []
     for joint in (spec.joint(joints[k]) for k in bare):
@@ -97,8 +96,8 @@ def regulate(
 ) -> None:  # fmt: skip
     """Give wheels without one an integral part beside their servo or motor, and a limit of what both pull together.
 
-    The integral part takes the same targets: torque = ki (integral of the target - angle of the wheel). A usual
-    controller of a robot's wheels is of this kind. Its gain starts where it hardly acts.
+    As usual controllers have: torque = ki (integral of the target - angle of the wheel). It starts where it hardly
+    acts.
     """
     for name, (_, total) in zip(joints, inertias, strict=True):
         joint = spec.joint(name)
@@ -142,10 +141,8 @@ def integrals(host: mujoco.MjModel, joints: Sequence[int]) -> tuple[int, ...]:
 def drive_gain(
     host: mujoco.MjModel, actuators: Sequence[int], inertias: Sequence[tuple[float, float]],
 ) -> tuple[float, float]:  # fmt: skip
-    """Gain of a speed controller before motors, and the highest with which a wheel in the air is stable.
-
-    The controller's torque is computed before a step, so it may take away at most a wheel's whole speed in one.
-    """
+    """Gain of a speed controller before motors, and the highest with which a wheel in the air is stable: computed
+    before a step, its torque may take away at most a wheel's whole speed in one."""
     wheel, total = (min(one) for one in zip(*inertias, strict=True))
     motor = max(abs(float(host.actuator_gear[one, 0] * host.actuator_gainprm[one, 0])) for one in actuators) or 1.0
     time = max(SERVO_TIME, 2 * host.opt.timestep)

@@ -22,17 +22,12 @@ SPEED = re.compile("VelocityJointInterface")
 class StatedDrive:
     """What a URDF says of its drive; empty for other files."""
 
-    left: tuple[str, ...] = ()
-    """Driven joints that a plugin names."""
+    left: tuple[str, ...] = ()  # driven joints that a plugin names
     right: tuple[str, ...] = ()
-    by_speed: tuple[str, ...] = ()
-    """Joints that a controller drives by their speed."""
-    steering: str = ""
-    """Plugin that drives it as a car or a tricycle."""
-    sideways: str = ""
-    """Plugin that drives it sideways too."""
-    rollers: tuple[str, ...] = ()
-    """Links that are drawn as mecanum or omni wheels."""
+    by_speed: tuple[str, ...] = ()  # joints that a controller drives by their speed
+    steering: str = ""  # plugin that drives it as a car or a tricycle
+    sideways: str = ""  # plugin that drives it sideways too
+    rollers: tuple[str, ...] = ()  # links that are drawn as mecanum or omni wheels
 
 
 def stated_drive(top: ElementTree.Element) -> StatedDrive:

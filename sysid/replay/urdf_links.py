@@ -21,8 +21,7 @@ def complete_links(path: Path, top: ElementTree.Element) -> list[str]:
     """Give links what simulators ask for and authors leave out; a note for each change.
 
     Where no link has a shape that touches, and on wheels and casters without one, the visible shape does. A mass of
-    zero is left out, so that the shape gives it. Moments of inertia that no body has become those of a ball, or are
-    balanced.
+    zero is left out, so that the shape gives it. Impossible moments of inertia become those of a ball, or are balanced.
     """
     _check_tree(path, top)
     notes = [*_held_parts(path, top), *_couplings(path, top)]
@@ -59,7 +58,7 @@ def _check_tree(path: Path, top: ElementTree.Element) -> None:
 
 
 def _held_parts(path: Path, top: ElementTree.Element) -> list[str]:
-    """Hold parts on joints that move in a plane or freely, which a robot's own parts cannot; a note for each. What
+    """Hold parts on joints that move in a plane or freely, which a robot's own parts cannot, a note for each; what
     moves the whole robot so is the free joint that it gets."""
     loose = [joint for joint in top.iter("joint") if joint.get("type") in ("planar", "floating")]
     children = {child.get("link") for joint in top.iter("joint") if (child := joint.find("child")) is not None}

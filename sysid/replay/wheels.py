@@ -29,14 +29,8 @@ MANY_TURNS = 200 * np.pi  # rad of a range that is no end
 def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDrive) -> tuple[str, ...]:
     """Names of the joints of the driven wheels: those on the left from front to rear, then those on the right.
 
-    Args:
-        path: of the file, for errors.
-        spec: mujoco.MjSpec.
-        wheels: joints or actuators that were named; of two the first is the left one.
-        stated: what the file says of its drive.
-
-    Raises:
-        ValueError: neither the file nor names show them, or they do not stand in pairs.
+    `wheels`: joints or actuators that were named, of two the left one first; `stated`: what the file says of its drive.
+    ValueError where neither the file nor names show them, or they do not stand in pairs.
     """
     hinges = {joint.name: joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name}
     driven = {actuator.name: actuator.target for actuator in spec.actuators}
@@ -113,8 +107,7 @@ class _Stand:
 
     place: np.ndarray  # (3,) m
     axis: np.ndarray  # (3,)
-    is_wheel: bool
-    """Whether it turns without an end about a level axis across the chassis, and hangs on no other hinge."""
+    is_wheel: bool  # whether it turns without an end about a level axis across the chassis, and hangs on no other hinge
 
     @property
     def direction(self) -> int:
@@ -213,8 +206,7 @@ def _by_side(standing: Mapping[str, _Stand], names: Sequence[str]) -> tuple[str,
 
 
 def _sides(names: Sequence[str]) -> list[int]:
-    """1 for a name of the left, -1 of the right, 0 of neither. What all names share, such as a robot's own name, says
-    nothing of a side."""
+    """1 for a name of the left, -1 of the right, 0 of neither; what all names share, as a robot's own, says nothing."""
     words = [{word for word in re.split(r"[^a-z0-9]+", name.lower()) if word} for name in names]
     shared = set.intersection(*words) if len(words) > 1 else set()
     found = []
