@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.plant.base import Effect
-from benchmarks.plant.chair import Chair, Nominal
+from benchmarks.plant.chair import COULOMB, Chair, Nominal
 from benchmarks.plant.commands import nine
-from benchmarks.plant.effects import EFFECTS
+from benchmarks.plant.effects import EFFECTS, in_proportion
+from benchmarks.plant.first_day import SMALL, SmallPlant
 from benchmarks.plant.sensors import odometry
 from benchmarks.plant.trial import Noise, Plant
 
@@ -63,6 +64,19 @@ def test_every_effect_fades_with_its_size(name):
     manoeuvre = "circle"
     plain, faint = drive(manoeuvre)[0], base(manoeuvre, name, 1e-4)[0]
     assert np.abs(faint.speed - plain.speed)[250:4500].max() < 0.03  # a tick of delay is 0.015 m/s
+
+
+def test_dry_friction_of_a_small_robot_slows_its_wheels_and_does_not_shake_them():
+    table = np.array([[0.0, 0.0, 0.0], [0.5, 0.1, 0.5], [2.0, 0.0, 0.0], [2.5, 0.0, 0.0]])
+    size = in_proportion("dry_friction", 2.0, SMALL)
+    reported = []
+    for effects in ([], [EFFECTS["dry_friction"].make(size, np.random.default_rng(0), SMALL)]):
+        log = SmallPlant(SMALL, COULOMB).drive(table, (0.0, 0.0, 0.0), effects, QUIET, np.random.default_rng(1))
+        reported.append(odometry(log, effects, QUIET, np.random.default_rng(2))[:, 4:])
+    without, slowed = reported
+    assert np.abs(slowed).max() <= 1.05 * np.abs(without).max()
+    rising = slice(27, 33)  # within a few frames after the command
+    assert slowed[rising, 0].mean() < without[rising, 0].mean()
 
 
 def test_half_of_the_known_effects_have_another_law_than_the_catalogue():
