@@ -28,14 +28,13 @@ from sysid.logs.columns import (
     unit_named,
     with_unit,
 )  # fmt: skip
-from sysid.logs.wheel_states import integrate_speeds
+from sysid.logs.wheel_states import DIFFERENCED, integrate_speeds, pose_speeds
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".tum")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LEAST = 10  # rows of a stream
-DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 LONGEST_NAME = 200  # characters
 HOUR = 3600.0  # s
 DAY = 86400.0  # s
@@ -604,10 +603,7 @@ def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> 
     elif wheels is not None:
         v, omega = (np.interp(t, wheels[:, 0], wheels[:, k]) for k in (1, 2))
     else:
-        half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
-        low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
-        dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
-        v, omega = (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
+        v, omega = pose_speeds(t, x, y, yaw)
         note = f"the odometry has poses only: v and omega are their differences over {DIFFERENCED:g} s"
     return np.column_stack([t, x, y, yaw, v, omega]), note
 
