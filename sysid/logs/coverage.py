@@ -15,7 +15,7 @@ from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
 from sysid.logs.standing import said, stood
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
-from sysid.logs.time_faults import pauses, time_faults, uncommanded
+from sysid.logs.time_faults import pauses, set_forward, time_faults, uncommanded
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
@@ -145,6 +145,8 @@ def doubts(log: Log) -> list[str]:
 def faults(log: Log, responses: Responses | None = None) -> list[str]:
     """Of what `sanity` says, units, signs, frames and times that are wrong."""
     trials, skid = log.trials, log.spec.drive == "skid"
+    if jumped := set_forward(trials):
+        return jumped
     found: list[str] = []
     cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
@@ -169,6 +171,9 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
             elif gain < 0 and channel == "ground_truth" and name == "v":
                 reversed_ones.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add "
                                      "pi to yaw, or negate the commands' v, whichever is wrong.")
+            elif gain < 0 and channel == "ground_truth":
+                reversed_ones.append(f"{where}: its sign is reversed, and x and y turn with yaw: z of its frame points "
+                                     "down (NED). Negate y and yaw, or the commands' omega, whichever is wrong.")
             elif gain < 0:
                 reversed_ones.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise "
                                      "positive omega and yaw; negate it.")

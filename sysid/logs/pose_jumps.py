@@ -94,7 +94,9 @@ def _frozen_of(name: str, trial: Trial) -> tuple[float, float, str, float] | Non
     inside = (beside.t >= begin) & (beside.t <= end)
     if end - begin < FROZEN or inside.sum() < 2:
         return None
-    way = float(np.hypot(*(np.ptp(one[inside]) for one in (beside.x, beside.y))))
+    steps = np.stack([np.diff(one[inside]) for one in (beside.x, beside.y)])
+    steps[:, np.isin(np.flatnonzero(inside)[:-1], _jumps_of(other, trial))] = 0.0  # no vehicle drives these
+    way = float(np.hypot(*np.ptp(np.cumsum(steps, axis=1), axis=1)))
     return (begin, end, other, way) if way > MOVED else None
 
 
