@@ -172,8 +172,9 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
                 reversed_ones.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add "
                                      "pi to yaw, or negate the commands' v, whichever is wrong.")
             elif gain < 0 and channel == "ground_truth":
-                reversed_ones.append(f"{where}: its sign is reversed, and x and y turn with yaw: z of its frame points "
-                                     "down (NED). Negate y and yaw, or the commands' omega, whichever is wrong.")
+                reversed_ones.append(f"{where}: it turns against the commands, and x and y with it. Either z of its "
+                                     "frame points down (NED): negate y and yaw; or the commands' omega has the wrong "
+                                     "sign.")
             elif gain < 0:
                 reversed_ones.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise "
                                      "positive omega and yaw; negate it.")

@@ -210,4 +210,4 @@ def test_a_frame_whose_z_points_down_is_named():
     trial = drive()
     down = replace(trial.ground_truth, y=-trial.ground_truth.y, yaw=-trial.ground_truth.yaw)
     (said,) = sanity(log_of(replace(trial, ground_truth=down)))
-    assert "z of its frame points down (NED). Negate y and yaw" in said
+    assert "z of its frame points down (NED): negate y and yaw" in said
