@@ -151,7 +151,7 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
     cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
-        found += contradicted[channel]
+        found += [one for one in contradicted[channel] if one not in found]
         seen, reversed_ones, clear = list[str](), list[str](), True
         shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):

@@ -211,3 +211,12 @@ def test_a_frame_whose_z_points_down_is_named():
     down = replace(trial.ground_truth, y=-trial.ground_truth.y, yaw=-trial.ground_truth.yaw)
     (said,) = sanity(log_of(replace(trial, ground_truth=down)))
     assert "z of its frame points down (NED): negate y and yaw" in said
+
+
+@pytest.mark.parametrize("name", ["odometry", "ground_truth"])
+def test_of_two_clocks_that_come_apart_the_faster_ones_gain_shows_no_unit(name):
+    trials = [drive(f"a_{seed}", seconds=40.0, seed=seed, gain=0.47) for seed in range(2)]
+    fast = [replace(one, **{name: replace(getattr(one, name), t=1.12 * getattr(one, name).t)}) for one in trials]
+    assert sanity(log_of(*trials)) == []
+    (said,) = sanity(log_of(*fast))
+    assert said.startswith("ground_truth: its clock runs") and "that of the odometry" in said
