@@ -3,6 +3,7 @@
     python -m benchmarks.fit --shared ../shared --parts planted plant chair contact few speed drive mrclam
 
     python -m benchmarks.fit --parts coverage --part 3/32 --work runs/fit       # one of 32 processes; the same with
+    python -m benchmarks.fit --parts contact few --part 3/3 --work runs/fit     # these parts, and with
     python -m benchmarks.fit --parts starts tpe searches --part 3/40 --work runs/fit          # these parts; restart
     python -m benchmarks.fit --parts many_starts --work runs/fit                # any that was stopped. On a GPU
     python -m benchmarks.fit --parts coverage starts tpe searches many_starts --collect --work runs/fit  # the figures
@@ -40,12 +41,14 @@ from benchmarks.fit_scores import CLAIM, against_replicates, evaluate, show, sho
 from benchmarks.fit_settings import Benchmark
 from benchmarks.harness import device_name, figure, record
 from sysid.logs.log import load_log
+from sysid.logs.metrics import noise_floor
 from sysid.logs.records import Log
 from sysid.search.comparison import Judge
-from sysid.search.fitting import Fit, fit_log, fitted_plant, make_objective, make_problem
+from sysid.search.fitting import Fit, fit_log, make_objective, make_problem
 from sysid.search.settings import FitConfig
 from whill_mjx.io.command_line import run
 
+UNSEEN = 16
 CHAIR = Path(__file__).parents[1] / "sysid" / "data" / "chair"
 
 
@@ -85,28 +88,44 @@ def few(settings: Benchmark) -> None:
 
 
 def days(settings: Benchmark, name: str, trials: set[str] | None = None) -> None:
-    """Held-out error of fits to days of the contact plant, over replicates; of these trials only, if they are given."""
+    """Error of fits to days of the contact plant on UNSEEN further drives of the held-out manoeuvre, over the spread of
+    these; of these trials only, if they are given. The spread of two drives is known to a third, which is too little.
+    """
     from benchmarks.plant.make import Experiment, make_log
 
-    ratios, seconds = [], []
-    for seed in settings.seeds:
+    def job(seed: str) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as folder:
-            make_log(Path(folder) / "log", Experiment(seed=seed))
+            make_log(Path(folder) / "log", Experiment(seed=int(seed)))
             log = load_log(Path(folder) / "log").select(lambda one: trials is None or one.name in trials)
+            held_out = tuple({one.manoeuvre for one in log.held_out})
+            make_log(Path(folder) / "more", Experiment(seed=int(seed), replicates=UNSEEN, manoeuvres=held_out))
+            more = load_log(Path(folder) / "more").trials
         fit = fit_log(log, settings.fitted())
-        ratios.append(against_replicates(fit, log, name)[1]["value"])
-        seconds.append(fit.seconds)
-        print(f"day {seed}: {ratios[-1]:.3f}; as stated: {', '.join(fit.stated) or 'nothing'}", flush=True)
-        figures = {f"{name}_replicate_ratio{settings.tag}": figure(ratios, "-"),
-                   f"seconds_{name}{settings.tag}": figure(seconds, "s")}
-        record("fit", CLAIM, figures)  # of the days so far
+        error = evaluate(fit, more)["summary"]["held_out"]["ground_truth"]["trajectory"]["fitted"]
+        floor = noise_floor(more)
+        assert floor is not None and floor["ground_truth"]["trajectory"] is not None
+        return {"ratio": error / floor["ground_truth"]["trajectory"], "seconds": fit.seconds,
+                "of_two": against_replicates(fit, log, name)[1]["value"], "as_stated": list(fit.stated)}
+
+    folder = settings.work / f"{name}{settings.tag}"
+    if not settings.collect:
+        run_jobs(folder, labels_of(settings.part, [str(seed) for seed in settings.seeds]), job)
+    results = [one for one in read_results(folder) if int(one["label"]) in settings.seeds]
+    for one in results:
+        print(f"day {one['label']}: {one['ratio']:.3f} ({one['of_two']:.3f} by its own two); as stated: "
+              f"{', '.join(one['as_stated']) or 'nothing'}")
+    if len(results) == len(settings.seeds):
+        ratios, seconds = ([one[of] for one in results] for of in ("ratio", "seconds"))
+        figures = on_device({f"{name}_replicate_ratio{settings.tag}": figure(ratios, "-"),
+                             f"seconds_{name}{settings.tag}": figure(seconds, "s")}, results)
+        record("fit", CLAIM, figures)
         show(figures)
 
 
 def planted(settings: Benchmark) -> None:
     """Planted truth of the same model: held-out error against the sensor noise, and starts that agree."""
+    from benchmarks.planted_logs import Schedule, fitted_plant, write_dataset
     from sysid.errors.space import make_space
-    from sysid.logs.synthetic import Schedule, write_dataset
     from whill_mjx.vehicle.parameters import get_values, set_values
     from whill_mjx.vehicle.presets import preset_params
     from whill_mjx.vehicle.specs import WHILL_CR

@@ -23,14 +23,14 @@ import numpy as np
 from benchmarks.fit_jobs import compile_once, reporter
 from benchmarks.fit_searches import compile_replay
 from benchmarks.harness import figure
+from benchmarks.planted_logs import Schedule, fitted_plant, write_dataset
 from sysid.errors.space import NUISANCE, Space, make_space, searched
 from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import Estimate, estimate, uncertainty_of
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.replay.models import with_effects
-from sysid.search.fitting import choose, fit_log, fitted_plant, make_problem
+from sysid.search.fitting import choose, fit_log, make_problem
 from sysid.search.settings import FitConfig
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params

@@ -9,9 +9,9 @@ import numpy as np
 
 from benchmarks.fit_scores import evaluate, gains, show, show_parameters
 from benchmarks.harness import figure, record
-from sysid.logs.lost_pose import lost, without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.records import Log, Trial
+from sysid.logs.unusable import lost, without_lost
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 
@@ -44,7 +44,7 @@ def measured_config(settings: Benchmark, preset: Literal["paper", "physical"]) -
 
 def drive(settings: Benchmark) -> None:
     """DRIVE: one fit per terrain and one pooled, to steps of 6 s, since those are foretold; the same vehicles on native
-    windows of 2 s, and on the steps whose outside pose was not lost (`sysid.logs.lost_pose`)."""
+    windows of 2 s, and on the steps whose outside pose was not lost (`sysid.logs.unusable`)."""
     folder = settings.shared / "data" / "measured" / "drive_norlab"
     native, chained = (load_drive(folder, DRIVE_RUNS, chained=chained) for chained in (False, True))
     everything = (tuple(sum(DRIVE_TRAIN.values(), ())), tuple(sum(DRIVE_HELD_OUT.values(), ())))

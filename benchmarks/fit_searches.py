@@ -22,7 +22,7 @@ from sysid.logs.log import load_log
 from sysid.logs.records import Log
 from sysid.search import least_squares, starts, tpe
 from sysid.search.comparison import Effort, Judge, arrivals, trace
-from sysid.search.fitting import Problem, choose, fitted_plant
+from sysid.search.fitting import Problem, choose
 from sysid.search.result import Stages, Trace
 from sysid.search.settings import FEATURE_ITERATIONS, FitConfig
 from sysid.search.studies import BATCH
@@ -47,7 +47,7 @@ def find_log(name: str, shared: Path, trials: int = 18) -> Log:
     """`planted`, `plant` (the shared plain chair) or a folder; of the latter two at most `trials` are fitted."""
     if name != "planted":
         return short_log(load_log(shared / "data" / "plant" / "plain" if name == "plant" else Path(name)), trials)
-    from sysid.logs.synthetic import write_dataset
+    from benchmarks.planted_logs import fitted_plant, write_dataset
     from whill_mjx.vehicle.presets import preset_params
     from whill_mjx.vehicle.specs import WHILL_CR
 

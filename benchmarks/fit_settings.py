@@ -21,7 +21,7 @@ class Benchmark:
                          "tpe", "searches", "drive", "mrclam"], ...] = (
         "planted", "plant", "chair", "contact", "drive", "mrclam")
     part: str = "1/1"
-    """I/N: of coverage, starts, tpe and searches, every N-th job, where several processes share them."""
+    """I/N: of contact, few, coverage, starts, tpe and searches, every N-th job, where several processes share them."""
     work: Path = Path("runs/fit")
     """Folder for the results of those jobs; what is there is not done again."""
     collect: bool = False

@@ -28,8 +28,8 @@ LAG = 0.15  # s in which a base follows a command to stop
 @cache
 def bases() -> dict[str, tuple[Drive, ...]]:
     """Drives that nothing is wrong with by robot: those of the shipped chair, and simulated ones."""
+    from benchmarks.planted_logs import Schedule, write_dataset
     from sysid.logs.log import load_log
-    from sysid.logs.synthetic import Schedule, write_dataset
     from whill_mjx.vehicle.presets import preset_params
     from whill_mjx.vehicle.specs import find_spec
 

@@ -37,11 +37,11 @@ from benchmarks.measured_laws import STARTS, ablate, make_bench
 from benchmarks.measured_peers import KINEMATIC, as_predictions, fit_kinematic, fit_network, fit_published, steps_of
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
 from sysid.logs.floor import BLOCKS, FloorChange, Measured, compared, in_blocks, sums_of
-from sysid.logs.lost_pose import lost, without_lost
 from sysid.logs.measured import load_drive, load_mrclam, split
 from sysid.logs.metrics import ideal_replay, score
 from sysid.logs.pose_lag import pose_lag
 from sysid.logs.records import Log, Prediction, Trial
+from sysid.logs.unusable import lost, without_lost
 from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import no_wander
 from sysid.missing.drives import make_drives

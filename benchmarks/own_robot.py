@@ -1,6 +1,6 @@
 """A robot of one's own in the closed loop: which effect is hidden in drives of a robot that came as a URDF file.
 
-    python -m benchmarks.own_robot --part 1/5 --out runs/own_robot     # in five processes
+    python -m benchmarks.own_robot --part 1/5 --out runs/own_robot     # in five processes; start again what was stopped
     python -m benchmarks.own_robot --collect                           # counts, and writes the figures
 
 A robot of 1.2 kg is driven on the contact plant, which shares no code with its model. Its wheels, track and markers are
@@ -14,13 +14,17 @@ Writes benchmarks/results/logs.json.
 
 from __future__ import annotations
 
-import json
+import fcntl
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks import kept
 from benchmarks.calibration import MANOEUVRES, short_drives
+from benchmarks.fit_jobs import labels_of, on_device, read_results, run_jobs
 from benchmarks.harness import figure, record
 from benchmarks.logs import CLAIM
 from benchmarks.plant.effects import EFFECTS, in_proportion
@@ -32,9 +36,10 @@ from sysid.pages.loop_report import effects as named_effects
 from sysid.search.settings import FitConfig
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import prepare, reference_for
-from sysid.verdict.result import LoopConfig
+from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.io import command_line
 from whill_mjx.io.folders import write_whole
+from whill_mjx.vehicle.specs import VehicleSpec
 
 WRONG = Wrong(x=0.05, y=-0.02)
 TESTED = ("command_delay", "command_dead_zone", "acceleration_limit", "command_scale", "actuator_lag", "dry_friction",
@@ -82,45 +87,62 @@ def drive(folder: Path, seed: int, replicates: int, effects: tuple[tuple[str, fl
     return folder
 
 
-def judge(config: Benchmark) -> None:
-    """Fit the robot, make its reference, and keep the verdict on each log of this part."""
-    first, count = (int(one) for one in config.part.split("/"))
-    out = config.out / f"part_{first}_of_{count}"
-    out.mkdir(parents=True, exist_ok=True)
-    began = time.perf_counter()
-    days = [load_log(drive(out / f"day_{k + 1}", FIRST_SEED + k, 3 if k == 0 else 1)) for k in range(config.days)]
-    fitted = out / "fit" / "vehicle.toml"
-    if not fitted.exists():
-        settings = FitConfig(model=str(write_urdf(out / "robot.urdf")), quick=True, elsewhere=False)
-        fit_dataset(out / "day_1", out / "fit", config=settings)
-        print(f"fitted, {time.perf_counter() - began:.0f} s", flush=True)
-    loop = LoopConfig(quick=config.quick)
-    spec, vehicle = load_fitted(fitted)
-    days = [of_file(day, spec, str(fitted)) for day in days]
-    reference = reference_for(days[0], days, loop, replace(vehicle, kept=False))
+@contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Hold a lock that ends with the process."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def ready_robot(config: Benchmark, loop: LoopConfig) -> tuple[Prepared, VehicleSpec, Path]:
+    """The robot ready for verdicts, its spec, and its vehicle file. The first process drives the days, fits the robot
+    and makes its reference; those that come later find each of these steps done."""
+    out, began = config.out, time.perf_counter()
+    fitted, made = out / "fit" / "vehicle.toml", out / "reference.pickle"
+    with alone(out / ".lock"):
+        days = [load_log(drive(out / f"day_{k + 1}", FIRST_SEED + k, 3 if k == 0 else 1)) for k in range(config.days)]
+        if not fitted.exists():
+            settings = FitConfig(model=str(write_urdf(out / "robot.urdf")), quick=True, elsewhere=False)
+            fit_dataset(out / "day_1", out / "fit", config=settings)
+            print(f"fitted, {time.perf_counter() - began:.0f} s", flush=True)
+        spec, vehicle = load_fitted(fitted)
+        days = [of_file(day, spec, str(fitted)) for day in days]
+        try:
+            reference = kept.loads(made.read_bytes())
+        except (FileNotFoundError, kept.KeptError):
+            reference = reference_for(days[0], days, loop, replace(vehicle, kept=False))
+            write_whole(made, kept.dumps(reference))
+            print(f"reference, {time.perf_counter() - began:.0f} s", flush=True)
     ready = prepare(reference, days[0].spec, loop)
-    print(f"reference, {time.perf_counter() - began:.0f} s", flush=True)
+    print(f"ready, {time.perf_counter() - began:.0f} s", flush=True)
+    return ready, spec, fitted
+
+
+def judge(config: Benchmark) -> None:
+    """Keep the verdict on each log of this part."""
     names = (*TESTED, *(f"null_{k + 1}" for k in range(config.nulls)))
-    for number, name in list(enumerate(names))[first - 1 :: count]:
-        path = config.out / "verdicts" / f"{name}.json"
-        if path.exists() or (config.only and name not in config.only):
-            continue
+    mine = [name for name in labels_of(config.part, names) if not config.only or name in config.only]
+    loop = LoopConfig(quick=config.quick)
+    ready, spec, fitted = ready_robot(config, loop)
+
+    def verdict_on(name: str) -> dict[str, Any]:
+        number = names.index(name)
         effects = ((name, size_of(name)),) if name in EFFECTS else ()
-        log = of_file(load_log(drive(out / f"log_{number}", LOG_SEED + number, 2, effects)), spec, str(fitted))
-        began_log = time.perf_counter()
+        log = of_file(load_log(drive(config.out / f"log_{number}", LOG_SEED + number, 2, effects)), spec, str(fitted))
         result = find_missing(log, (), loop, reference=ready)
-        verdict_of = result.search.verdict
-        found = [[one["name"], *one["class"]] for one in named_effects(result)] if verdict_of == "named" else []
-        verdict = {"effect": name, "size": size_of(name) if effects else 0.0, "verdict": verdict_of,
-                   "named": found, "seconds": time.perf_counter() - began_log}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, json.dumps(verdict, indent=1) + "\n")
-        print(f"{name}: {verdict['verdict']} {found}, {verdict['seconds']:.0f} s", flush=True)
+        verdict = result.search.verdict
+        found = [[one["name"], *one["class"]] for one in named_effects(result)] if verdict == "named" else []
+        print(f"{name}: {verdict} {found}", flush=True)
+        return {"effect": name, "size": size_of(name) if effects else 0.0, "verdict": verdict, "named": found}
+
+    run_jobs(config.out / "verdicts", mine, verdict_on)
 
 
 def collect(config: Benchmark) -> dict[str, Any]:
     """Figures of all verdicts: right is a log whose effect is in the class of one that was named, and no other."""
-    verdicts = [json.loads(path.read_text()) for path in sorted((config.out / "verdicts").glob("*.json"))]
+    verdicts = read_results(config.out / "verdicts")
     right, false = [], []
     for one in verdicts:
         if one["effect"] in EFFECTS:
@@ -131,10 +153,11 @@ def collect(config: Benchmark) -> dict[str, Any]:
             false.append(float(one["verdict"] != "none"))
     if not right:
         raise ValueError(f"{config.out}: no verdict on a log with an effect. Run some parts first.")
-    return {"own_robot_loop_right": {**figure(right, "logs with the right class"), "value": sum(right)},
-            "own_robot_loop_logs": {**figure(right, "logs"), "value": float(len(right))},
-            **({"own_robot_loop_false": {**figure(false, "alarms of logs without an effect"), "value": sum(false)}}
-               if false else {})}
+    figures = {"own_robot_loop_right": {**figure(right, "logs with the right class"), "value": sum(right)},
+               "own_robot_loop_logs": {**figure(right, "logs"), "value": float(len(right))}}
+    if false:
+        figures["own_robot_loop_false"] = {**figure(false, "alarms of logs without an effect"), "value": sum(false)}
+    return on_device(figures, verdicts)
 
 
 def main(config: Benchmark) -> None:

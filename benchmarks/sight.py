@@ -62,7 +62,7 @@ def many_states(env: Env, params: Any, worlds: int) -> State:
 
 
 def frames(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
-    """Images per second, by the jnp renderer and, on NVIDIA GPUs, by the kernel."""
+    """Images per second, by the jnp renderer and, on NVIDIA GPUs, by the kernel, and how far the two differ there."""
     env, params = make_env("corridor", looks="rich")
     states = many_states(env, params, worlds)
     lens = pinhole(env.model.spec.camera.fov_y)
@@ -74,6 +74,12 @@ def frames(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
     if jax.devices()[0].platform == "gpu":
         ways = {"rich_frames_per_s": render_pallas, **ways}
     found = {}
+    if len(ways) > 1:
+        few = jax.tree.map(lambda leaf: leaf[:DIFFERENT], states)
+        one, other = (jax.jit(jax.vmap(picture(draw)))(few).astype(jnp.int32) for draw in ways.values())
+        apart = float(jnp.mean(jnp.max(jnp.abs(one - other), -1) > 1))
+        found["rich_pixels_apart"] = figure([apart], "share of pixels that differ by more than one grey level")
+        print(f"kernel and renderer: {apart:.2%} of the pixels differ by more than one grey level", flush=True)
     for name, draw in ways.items():
         try:
             call = jax.jit(jax.vmap(picture(draw)))

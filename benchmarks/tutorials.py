@@ -195,6 +195,7 @@ def notebook_text(page: Path, tests: bool = False) -> str:
     for block in blocks(page) if tests else ():
         text = text.replace(block.code, block.in_tests)
     text = re.sub(r"^<!-- in .*?-->\n", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^```sh\n", "```sh\nset -e\n", text, flags=re.MULTILINE)  # else only a cell's last line can fail
     parts = re.split(r"(^```.*?^```)", text, flags=re.DOTALL | re.MULTILINE)
 
     def moved(match: re.Match[str]) -> str:

@@ -7,10 +7,12 @@
     for i in $(seq 28); do python -m benchmarks.undeclared --scales 2 4 --seeds 4 --pairs 90 --share & done; wait
     for i in $(seq 16); do python -m benchmarks.undeclared --sensor-noise 0.5 2 4 --share & done; wait
     python -m benchmarks.undeclared --collect
+    python -m benchmarks.undeclared --draw 1 --nulls 8 --scales 2 4 --pairs 8
 
 The second form drives logs with the contact plant (`benchmarks/undeclared_plant.py`), the others do so in processes
 that share a folder, each with a part of its own or with whatever is left. Verdicts are kept in `runs/undeclared` and a
-run that was stopped goes on where it was; the figures are written at the end from all verdicts there.
+run that was stopped goes on where it was; the figures are written at the end from all verdicts there. The last form
+drives logs that no record has used.
 """
 
 from __future__ import annotations
@@ -75,6 +77,10 @@ class Benchmark:
     vehicle: Literal["chair", "scooter", "robot"] = "chair"
     """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own. `speed` and `classes`
     are of the chair."""
+    draw: Annotated[int, NOT_NEGATIVE] = 0
+    """Another draw of all that is driven: other seeds, reference days and pairs. Each needs a `work` of its own; the
+    names of its verdicts have its number, so those of several draws can be collected from one folder. Their figures
+    end in `_fresh`: the weights of the decision were chosen with draw 0 in view."""
     pairs: Annotated[int, NOT_NEGATIVE] = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False
@@ -82,7 +88,7 @@ class Benchmark:
     only: tuple[str, ...] = ()
     """Only logs with these effects, of those from `base` and `scales`."""
     labels: tuple[str, ...] = ()
-    """Only logs of these names, in this order, of all that the other options ask for."""
+    """Only logs of these names (without the number of a draw), in this order, of all that the other options ask for."""
     full: Annotated[int, COUNT] = 4
     """Every how many-th named log also has its held-out trials opened."""
     speed: bool = False
@@ -108,7 +114,7 @@ class Benchmark:
     @property
     def driven(self) -> Driven:
         """What drives the logs."""
-        return Driven(self.noise, self.vehicle)
+        return Driven(self.noise, self.vehicle, self.draw)
 
 
 def main(settings: Benchmark) -> None:
@@ -197,7 +203,8 @@ def wanted(settings: Benchmark) -> list[contact.Job]:
         listed += contact.left_out_jobs(work, part)
     listed += contact.pair_jobs(work, settings.pairs, part, driven)
     by_name = {job.label: job for job in listed}
-    return [by_name[label] for label in settings.labels if label in by_name] if settings.labels else listed
+    chosen = [by_name[label] for label in settings.labels if label in by_name] if settings.labels else listed
+    return [replace(job, label=driven.label(job.label), log=driven.label(job.log)) for job in chosen]
 
 
 def look_alikes(settings: Benchmark) -> None:

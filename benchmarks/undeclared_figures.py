@@ -16,7 +16,7 @@ from benchmarks.harness import device_name, figure, provenance, record
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.undeclared_plant import RECORDED, power_sizes
 from benchmarks.undeclared_reference import USUAL, Driven
-from sysid.follow_up.calibrated import FILE, calibrated
+from sysid.follow_up.power import FILE, calibrated
 from sysid.intervals.statistics import upper_rate
 from sysid.pages.report import write_report
 from sysid.verdict import posterior as decision
@@ -76,10 +76,10 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
     cases += noisy  # others may have been judged in another folder
     judged = {_kind(truth, one["stage"]) for truth, one in cases}
     kept = [row for row in recorded.get("confusion", [])
-            if _kind(row["truth"], row["stage"]) not in judged or driven_of(row) != driven]
+            if _kind(row["truth"], row["stage"]) not in judged or driven_of(row).tag != driven.tag]
     content["confusion"] = kept + [
         {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": driven.noise,
-         "vehicle": driven.vehicle, "verdict": one["verdict"],
+         "vehicle": driven.vehicle, "draw": one.get("draw", 0), "verdict": one["verdict"],
          "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
          "explained": one["share"], "sensor_noise": one.get("noise", 1.0)} for truth, one in cases]
     write_report(path, content)
@@ -87,7 +87,7 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
 
 def driven_of(row: Mapping[str, Any]) -> Driven:
     """What a recorded row is of; older rows, from before there were other vehicles and noise levels, do not say."""
-    return Driven(row.get("noise", 1.0), row.get("vehicle", "chair"))
+    return Driven(row.get("noise", 1.0), row.get("vehicle", "chair"), row.get("draw", 0))
 
 
 def _kind(truth: Mapping[str, float], stage: str) -> tuple[str, ...]:
@@ -160,12 +160,12 @@ def of_noisy_nulls(nulls: Sequence[dict[str, Any]], tag: str, level: str) -> dic
 
 def sets_of(nulls: Sequence[dict[str, Any]]) -> int:
     """How many sets of reference days these logs are judged against."""
-    return len({one.get("reference", 0) for one in nulls})
+    return len({(one.get("draw", 0), one.get("reference", 0)) for one in nulls})
 
 
 def calibrates(null: dict[str, Any]) -> bool:
     """Whether a log with nothing in it is for calibrating p-values; the others show whether they are uniform."""
-    return null.get("reference", 0) % 2 == 0
+    return not null.get("draw", 0) and null.get("reference", 0) % 2 == 0
 
 
 def calibrate(work: Path) -> None:

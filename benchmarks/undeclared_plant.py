@@ -158,7 +158,7 @@ def pair_jobs(work: Path, pairs: int, part: str, driven: Driven = USUAL) -> list
     """Logs with two effects each, at four times that size; the sizes of all effects must be there."""
     sizes = power_sizes(work, driven)
     known = [name for name in sorted(EFFECTS) if EFFECTS[name].known and name in sizes]
-    random, out = np.random.default_rng(7), []
+    random, out = np.random.default_rng([7, driven.draw] if driven.draw else 7), []
     for n in range(pairs if len(known) > 1 else 0):
         first, second = random.choice(known, 2, replace=False)
         effects = {str(name): capped(name, 4 * sizes[name], driven) for name in (first, second)}
@@ -270,12 +270,13 @@ def judge(
         return json.loads(verdict.read_text())
     folder = work / "logs" / (job.log or job.label)
     if not folder.exists():
-        make_log(folder, Experiment(effects=job.effects, seed=job.seed, noise=driven.noise * job.noise,
+        make_log(folder, Experiment(effects=job.effects, seed=driven.seed(job.seed), noise=driven.noise * job.noise,
                  vehicle=driven.vehicle))
     began = time.perf_counter()
     config = replace(config, without=job.without)
     result = find_missing(load_log(folder), (), config, reference=ready)
-    content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, "noise": job.noise, **brief(result),
+    content = {"stage": job.stage, "scale": job.scale, "reference": job.reference, "draw": driven.draw,
+               "noise": job.noise, **brief(result),
                "seconds": time.perf_counter() - began, "device": device_name()}
     if full and result.search.verdict == "named":
         report = make_report(result)

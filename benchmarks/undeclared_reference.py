@@ -37,14 +37,27 @@ class Driven:
     """Factor on all disturbances and sensor noise."""
     vehicle: str = "chair"
     """Of `benchmarks.plant.chair.VEHICLES`."""
+    draw: int = 0
+    """Number of the draw of all logs and reference days: each has seeds and pairs of its own."""
+
+    def seed(self, seed: int) -> int:
+        """A seed of the first draw, as it is in this one."""
+        return seed + PER_DRAW * self.draw
+
+    def label(self, label: str) -> str:
+        """A log of the first draw, as it is named in this one."""
+        return f"{label}_draw_{self.draw}" if self.draw and label else label
 
     @property
     def tag(self) -> str:
-        """What the names of its figures end in."""
+        """What the names of its figures end in. Draws that the weights were not chosen with have them in common."""
         noise = "" if self.noise == 1.0 else f"_noise_{self.noise:g}"
-        return noise if self.vehicle == "chair" else f"{noise}_{self.vehicle}"
+        vehicle = "" if self.vehicle == "chair" else f"_{self.vehicle}"
+        return f"{noise}{vehicle}{'_fresh' if self.draw else ''}"
 
 
+PER_DRAW = 10_000_000
+"""How far the seeds of a draw are from those of the one before."""
 USUAL = Driven()
 DAYS = 6
 FIRST_SEED, SEEDS = 11001, 10
@@ -74,7 +87,7 @@ def reference_days(work: Path, driven: Driven = USUAL, number: int = 0) -> list[
         path = folder_of(work, number) / f"day_{day + 1}"
         if not path.exists():
             try:
-                make_log(path, Experiment(seed=FIRST_SEED + SEEDS * number + day, noise=driven.noise,
+                make_log(path, Experiment(seed=driven.seed(FIRST_SEED + SEEDS * number + day), noise=driven.noise,
                          replicates=3 if day == 0 else 1, vehicle=driven.vehicle))
             except OSError:
                 if not path.exists():  # else another part was quicker

@@ -80,11 +80,22 @@ class FrameLog:
 
     @property
     def pace(self) -> float:
-        """Seconds of the camera's clock per second of ours; 1 where too few messages came."""
-        if len(self._frames) < 3:
+        """Seconds of the camera's clock per second of ours; 1 where too few messages came.
+
+        The gap over which the two clocks differ most is left out: the camera's may have been set there.
+        """
+        times = [(now, stamp) for now, stamp, *_ in self._frames]
+        gaps = [(now - before, stamp - old) for (before, old), (now, stamp) in zip(times, times[1:], strict=False)]
+        if len(gaps) < 3:
             return 1.0
-        (first, first_stamp, *_), (last, last_stamp, *_) = self._frames[0], self._frames[-1]
-        return (last_stamp - first_stamp) / (last - first) if last > first else 1.0
+        gaps.remove(max(gaps, key=lambda gap: abs(gap[1] - gap[0])))
+        ours, cameras = (sum(part) for part in zip(*gaps, strict=True))
+        return cameras / ours if ours > 0 else 1.0
+
+    @property
+    def has_one_stamp(self) -> bool:
+        """True where at least five messages came in the window, all with the same stamp."""
+        return len(self._frames) >= 5 and len({stamp for _, stamp, *_ in self._frames}) == 1
 
     @property
     def unchanged(self) -> bool:
@@ -152,6 +163,8 @@ def input_cause(name: str, topic: str, kind: str, publishers: list[Endpoint], st
         return f"{topic} carries {', '.join(wrong)}, and the policy's {name} is a {kind}: remap it to the right topic"
     if not publishers:
         return f"no publisher on {topic}, the policy's {name}: start the {stream.sensor.kind}, or remap the topic"
+    if len(publishers) > 1:  # all are of the right kind
+        return _mixed(topic, publishers, "messages")
     if now - stream.received <= SILENT and stream.unusable:
         return f"{topic}: {stream.unusable}"
     if stream.is_silent(now):
@@ -164,10 +177,21 @@ def input_cause(name: str, topic: str, kind: str, publishers: list[Endpoint], st
     return ""
 
 
+def fitting(publishers: list[Endpoint], kind: str) -> list[Endpoint]:
+    """Return the publishers whose messages are read; those of more than one mix."""
+    return [one for one in publishers if one.type == kind]
+
+
+def _mixed(topic: str, publishers: list[Endpoint], what: str) -> str:
+    """Return what is wrong where several nodes publish on the topic of an input."""
+    names = ", ".join(sorted(one.node for one in publishers))
+    return f"{topic} has {len(publishers)} publishers ({names}): their {what} mix; stop or remap all but one"
+
+
 def _camera_causes(evidence: Evidence) -> list[str]:
     """Return why frames do not come, or come from more than one source."""
     topic = evidence.image_topic
-    fitting = [camera for camera in evidence.cameras if camera.type == evidence.image_type]
+    cameras = fitting(evidence.cameras, evidence.image_type)
     wrong = sorted({camera.type for camera in evidence.cameras} - {evidence.image_type})
     found = []
     if wrong:
@@ -176,16 +200,15 @@ def _camera_causes(evidence: Evidence) -> list[str]:
     elif not evidence.cameras and not evidence.starting:
         found.append(f"no publisher on {topic}: start the {evidence.sensor}, or compare ROS_DOMAIN_ID and the topic "
                      "name")
-    if len(fitting) > 1:
-        names = ", ".join(sorted(camera.node for camera in fitting))
-        found.append(f"{topic} has {len(fitting)} publishers ({names}): their images mix; stop or remap all but one")
-    if not fitting or evidence.frames.count or not evidence.settled:
+    if len(cameras) > 1:
+        found.append(_mixed(topic, cameras, "images" if evidence.sensor == "camera" else "messages"))
+    if not cameras or evidence.frames.count or not evidence.settled:
         return found
     if evidence.incompatible:
         found.append(f"{topic}: the publisher's quality of service does not fit a best-effort, volatile reader: "
                      "change it")
     else:
-        found.append(f"{topic}: {len(fitting)} publisher(s) matched but no frame arrives. {profile_remedy()}")
+        found.append(f"{topic}: {len(cameras)} publisher(s) matched but no frame arrives. {profile_remedy()}")
     return found
 
 
@@ -206,18 +229,27 @@ def _frame_causes(evidence: Evidence) -> list[str]:
     elif slow and not evidence.pace_by_stamp:
         found.append(f"{topic}: {frames.rate:.1f} frames/s arrive, the policy needs {evidence.rate_hz:g}: raise the "
                      f"{evidence.sensor}'s rate")
-    if abs(frames.stamp_age) > evidence.stamp_limit:
-        side = "behind" if frames.stamp_age > 0 else "ahead of"
-        found.append(f"the {evidence.sensor}'s clock is {abs(frames.stamp_age):.2f} s {side} this computer's: "
-                     "synchronise both (chrony, ptp), or give --stamp-age inf")
-    if not evidence.pace_by_stamp and not 0.8 <= frames.pace <= 1.25:
-        found.append(f"the stamps run at {frames.pace:.2f} times real time: run the simulator in real time, or give "
-                     "--pace stamp")
+    found += [f"{topic}: every message has the same stamp: let the {evidence.sensor}'s node stamp each one "
+              "(header.stamp)"] if frames.has_one_stamp else _clock_causes(evidence)
     if frames.unchanged:
         found.append(f"{topic}: the frames do not change: the {evidence.sensor} is frozen, or looks at one still "
                      "picture")
     if evidence.blind:
         found.append(f"{topic}: the frames are uniformly black or white: check lens, light and exposure")
+    return found
+
+
+def _clock_causes(evidence: Evidence) -> list[str]:
+    """Return what is wrong with the stamps of frames that come."""
+    frames, found = evidence.frames, []
+    if abs(frames.stamp_age) > evidence.stamp_limit:
+        side = "behind" if frames.stamp_age > 0 else "ahead of"
+        found.append(f"the {evidence.sensor}'s clock is {abs(frames.stamp_age):.2f} s {side} this computer's: "
+                     "synchronise both (chrony, ptp), take the simulator's /clock (use_sim_time) where it is "
+                     "simulated, or give --stamp-age inf")
+    if not evidence.pace_by_stamp and not 0.8 <= frames.pace <= 1.25:
+        found.append(f"the stamps run at {frames.pace:.2f} times real time: run the simulator in real time, or give "
+                     "--pace stamp")
     return found
 
 

@@ -16,9 +16,9 @@ from typing import Any
 
 from bridge import parameters, ros
 from bridge.bases import BASES
-from bridge.commands import endpoints
+from bridge.commands import Endpoint, endpoints
 from bridge.controller import Caution, Controller
-from bridge.diagnosis import Evidence, FrameLog, causes, input_cause
+from bridge.diagnosis import Evidence, FrameLog, causes, fitting, input_cause
 from bridge.exits import Exit, OptionError, refusal
 from bridge.image import ImageError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
@@ -34,6 +34,7 @@ PAUSE = (0.01, 0.06)
 SILENCE = 0.3
 """Seconds without a frame after which there is always time."""
 CLOCK_STANDS = "simulated time stands"
+MIXED = "an input has two publishers"
 STARTING = 2.0
 """Seconds that the discovery of other nodes may take."""
 
@@ -95,6 +96,7 @@ class DriveNode(VehicleNode):
         self.controller = controller
         self._frames = FrameLog()
         self._incompatible = False
+        self._publishers: dict[str, list[Endpoint]] = {}
         self._camera_since = self._started
         self._last_frame = -math.inf
         pacer = controller.policy.pacer
@@ -133,13 +135,21 @@ class DriveNode(VehicleNode):
             self._ticked, self._simulated = now, simulated
         self.supervisor.block(CLOCK_STANDS, now + WATCH_PERIOD - self._ticked > self.options.frame_age)
 
+    def _on_look(self) -> None:
+        """Look at the graph, also for who sends the policy's inputs: it does not drive on a mixture of two sources."""
+        self._publishers = {name: endpoints(self.node.get_publishers_info_by_topic(topic.topic))
+                            for name, topic in self._topics.items()}
+        self.supervisor.block(MIXED, any(len(fitting(self._publishers[name], topic.full_kind)) > 1
+                                         for name, topic in self._topics.items()))
+        super()._on_look()
+
     def causes(self) -> list[str]:
         """Return what is wrong with sensors, base and guard now, each with its remedy."""
         now = time.monotonic()
         found = causes(self._evidence())
         for name, stream in self.controller.senses.streams.items():
             topic = self._topics[name]
-            publishers = endpoints(self.node.get_publishers_info_by_topic(topic.topic))
+            publishers = self._publishers.get(name, [])
             cause = input_cause(name, topic.topic, topic.full_kind, publishers, stream, now)
             if cause and (publishers or now - self._started > STARTING):
                 found.append(cause)
@@ -207,7 +217,7 @@ class DriveNode(VehicleNode):
     def _evidence(self) -> Evidence:
         now = time.monotonic()
         self._frames.trim(now)
-        cameras = endpoints(self.node.get_publishers_info_by_topic(self._pacer.topic))
+        cameras = self._publishers.get(self.controller.policy.pacer.name, [])
         if not cameras:
             self._camera_since = now
         settled = self._frames.is_full(now) if self._frames.count else now - self._camera_since > STARTING

@@ -15,6 +15,7 @@ import numpy as np
 from bridge.frames import FrameWatch, Verdict
 
 NO_FRAME = "no frame yet"
+WAITING = "waiting for fresh frames"
 
 
 class State(Enum):
@@ -206,7 +207,7 @@ class Supervisor:
             self.counts[verdict] += 1
             return verdict
         if self._cause == NO_FRAME:
-            self._cause = "waiting for fresh frames"
+            self._cause = WAITING
         elif silent:
             self.fault("frame age")
         if self._frames.frozen:
@@ -289,8 +290,10 @@ class Supervisor:
                 self.latch(reason)
             else:
                 self.fault(reason)
-        elif not active:
+        elif not active and reason in self._holds:
             self._holds.discard(reason)
+            if self._cause == reason:
+                self._cause = WAITING
 
     def arm(self) -> bool:
         """Operator: release the latch. Returns False, and stays latched, while a condition holds or another drives."""
@@ -298,7 +301,8 @@ class Supervisor:
             return False
         if self._advance(Event.ARM):
             self.latched = ""
-            self._cause = self._cause or "armed"
+            if self._cause != NO_FRAME:
+                self._cause = WAITING  # what stopped it is over
             self._bad.clear()
         return True
 

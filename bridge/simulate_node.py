@@ -42,8 +42,11 @@ class SimulateNode:
         from sensor_msgs.msg import CameraInfo, Image, LaserScan
         from std_msgs.msg import Bool, Header
 
+        log = node.get_logger()
+        log.info("compiling the simulator: up to a minute where it has not run before")
         vehicle.reset(options.seed)
         vehicle.step(0.0, 0.0)  # compiles, where the simulator does; before anybody waits for frames
+        log.info(f"ready; commands are heard on {node.resolve_topic_name(ros.COMMAND_TOPIC)}")
         self.node, self.vehicle, self.options = node, vehicle, options
         self.clock = SimulatedClock(options.speed, options.clock)
         self._bool, self._header = Bool, Header
@@ -231,7 +234,7 @@ class SimulateNode:
         self._frame = None
         self._begin_at = time.monotonic() + RESET_SILENCE
         if not self.stepped:
-            self.node.get_logger().info(f"episode {len(self.episodes)}: {episode}")
+            self.node.get_logger().info(f"episode {len(self.episodes)}: {episode.summary()}")
         if len(self.episodes) == self.options.episodes and not self.stepped:
             self.finished_at = time.monotonic()
         if self.options.results and not self.stepped:

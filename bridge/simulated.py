@@ -93,6 +93,12 @@ class Episode:
     ended: float = 0.0
     """Steady time of the last image [s]."""
 
+    def summary(self) -> str:
+        """Return the outcome in words."""
+        how = "collided" if self.collided else "arrived" if self.reached_goal else "neither arrived nor collided"
+        return (f"{how} after {self.steps} steps and {self.commands} commands, at x {self.x:.2f} m, y {self.y:.2f} m "
+                f"(seed {self.seed})")
+
 
 class SimulatedClock:
     """Simulated time: what stamps count in, and what a control period lasts on the steady clock; pure.

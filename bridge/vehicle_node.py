@@ -248,7 +248,7 @@ class VehicleNode:
                                   "holds": supervisor.holds, "causes": found, "counts": dict(supervisor.counts),
                                   **self.details()}
         self._status.publish(self._string(data=json.dumps(status)))
-        text = ". ".join([f"{state.value}: {reason}" if reason else state.value, *found])
+        text = ". ".join(part.rstrip(".") for part in [f"{state.value}: {reason}" if reason else state.value, *found])
         self._diagnose(state is State.DRIVING and not found, text, status["counts"])
         report = (state.value, reason, *found)
         if report != self._reported:

@@ -17,9 +17,12 @@ OPSET = 18
 IR_VERSION = 8
 """ONNX file version that belongs to opset 18."""
 ACTION_TOLERANCE = 1e-5
-"""Largest difference of two actions in [-1, 1], or probabilities, that still counts as float32 rounding of one step."""
+"""Difference of two actions in [-1, 1], or probabilities, in the median step. A wrong export differs at every step."""
+RESOLVED = 1e-3
+"""Largest difference in any step: vehicles resolve no more of their range. Where a network is steep, it magnifies the
+rounding of float32 by as much as its slope, so a single step may differ by more than the median."""
 FLIP_SHARE = 0.02
-"""Share of steps in which an argmax may fall to the other side of a tie. A wrong export differs at every step."""
+"""Share of steps in which an argmax may fall to the other side of a tie."""
 
 Carry = dict[str, jax.Array]
 Shapes = dict[str, jax.ShapeDtypeStruct]
@@ -147,7 +150,8 @@ def parity(model: bytes, network: Network, steps: int) -> dict[str, Any]:
     carry: Any = {name: np.zeros(shape.shape, shape.dtype) for name, shape in network.carry.items()}
     own_carry = list(carry.values())
     rng = np.random.default_rng(0)
-    worst, drift, flips = 0.0, 0.0, 0
+    apart: list[float] = []
+    drift, flips = 0.0, 0
     for _ in range(steps):
         obs = {name: _noise(rng, shape) for name, shape in network.observations.items()}
         one_action, one_carry = onnx_step([np.asarray(carry[name]) for name in names], obs)
@@ -162,11 +166,12 @@ def parity(model: bytes, network: Network, steps: int) -> dict[str, Any]:
         if _distance(jax_carry, one_carry) > 0.5:
             flips += 1
         else:
-            worst = float(np.maximum(worst, _distance([action], [one_action])))
-    if not worst <= ACTION_TOLERANCE or flips > FLIP_SHARE * steps:  # a NaN fails too
-        raise ValueError(f"policy.onnx: a step of it differs from JAX by up to {worst:.2g} with {flips} latent flips "
-                         f"in {steps} steps; at most {ACTION_TOLERANCE} and {FLIP_SHARE:.0%} flips are rounding. "
-                         "Export a deterministic step that computes in float32.")
+            apart.append(_distance([action], [one_action]))
+    worst, usual = (float(of(apart)) if apart else 0.0 for of in (np.max, np.median))
+    if not (usual <= ACTION_TOLERANCE and worst <= RESOLVED) or flips > FLIP_SHARE * steps:  # a NaN fails too
+        raise ValueError(f"policy.onnx: in {steps} steps it differs from JAX by {usual:.2g} in the median and "
+                         f"{worst:.2g} at most, with {flips} latent flips; rounding is {ACTION_TOLERANCE}, {RESOLVED}, "
+                         f"{FLIP_SHARE:.0%} flips. Export a deterministic step that computes in float32.")
     return {"steps": steps, "max_abs_action_difference": worst, "max_abs_action_drift": drift, "latent_flips": flips}
 
 

@@ -28,26 +28,19 @@ if TYPE_CHECKING:
     from sysid.verdict.preparation import prepare as prepare
     from sysid.verdict.result import LoopConfig as LoopConfig
 
-_HOMES = {
-    "Log": "sysid.logs.log",
-    "Trial": "sysid.logs.log",
-    "Command": "sysid.logs.log",
-    "OdometryStream": "sysid.logs.log",
-    "PoseStream": "sysid.logs.log",
-    "load_log": "sysid.logs.log",
-    "load_any": "sysid.logs.measured",
-    "FitConfig": "sysid.search.settings",
-    "fit_log": "sysid.search.fitting",
-    "predict": "sysid.search.fitting",
-    "fit_dataset": "sysid.pages.fit_report",
-    "function_model": "sysid.replay.models",
-    "mjcf_model": "sysid.replay.mjcf",
-    "read_report": "sysid.pages.report",
-    "LoopConfig": "sysid.verdict.result",
-    "Thresholds": "sysid.verdict.posterior",
-    "prepare": "sysid.verdict.pipeline",
-    "find_missing": "sysid.verdict.pipeline",
-}
+_HOMES = {name: home for home, names in {
+    "sysid.logs.log": ("Log", "Trial", "Command", "OdometryStream", "PoseStream", "load_log"),
+    "sysid.logs.measured": ("load_any",),
+    "sysid.search.settings": ("FitConfig",),
+    "sysid.search.fitting": ("fit_log", "predict"),
+    "sysid.pages.fit_report": ("fit_dataset",),
+    "sysid.replay.models": ("function_model",),
+    "sysid.replay.mjcf": ("mjcf_model",),
+    "sysid.pages.report": ("read_report",),
+    "sysid.verdict.result": ("LoopConfig",),
+    "sysid.verdict.posterior": ("Thresholds",),
+    "sysid.verdict.pipeline": ("prepare", "find_missing"),
+}.items() for name in names}
 __all__ = list(_HOMES)
 
 

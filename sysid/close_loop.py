@@ -11,7 +11,7 @@ within their day-to-day spread, and the verdict is one of
 Without a reference the question is what the model family lacks; effects that base parameters imitate (mass, track,
 scrub, friction, drag, traction) cannot be seen then. Held-out trials are opened after the verdict only.
 
-Writes RUN/report.json (`sysid.pages.loop_report`), RUN/report.html, RUN/method.html and, with the effect in it,
+Writes RUN/report.json (docs/formats.md), RUN/report.html, RUN/method.html and, with the effect in it,
 RUN/vehicle.toml. A loop that was stopped goes on where it was when the same command is given again.
 """
 

@@ -1,8 +1,8 @@
 """Fit a vehicle to a driving log: `python -m sysid.fit DATASET --out RUN`.
 
 Only training trials are fitted; held-out ones are predicted once, at the end, by the initial and the fitted vehicle.
-Writes RUN/report.json and RUN/report.html (`sysid.report`), RUN/series.npz, RUN/*.png and RUN/vehicle.toml. A fit that
-was stopped goes on where it was when the same command is given again.
+Writes RUN/report.json (entries: docs/formats.md), RUN/report.html, RUN/series.npz, RUN/*.png and RUN/vehicle.toml. A
+fit that was stopped goes on where it was when the same command is given again.
 """
 
 from __future__ import annotations

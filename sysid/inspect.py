@@ -87,8 +87,7 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
 
 def write(folder: Path, log: Log, found: dict[str, Any], drives: Sequence[NextDrive] = ()) -> list[Path]:
     """Write inspect.txt, .json, .png and .html and the scripts of drives; returns their paths."""
-    from sysid.pages.inspect_page import write_page
-    from sysid.pages.inspect_plot import write_plot
+    from sysid.pages.inspect_page import write_page, write_plot
     from sysid.pages.report import write_report
     from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv, write_text
 

@@ -39,11 +39,7 @@ STOPPED = "stopped; give the same command again to go on."
 
 
 def select(log: Log, channel: str = "odometry") -> Log:
-    """The five manoeuvres' drives, with the figure-eight, and nothing else, held out.
-
-    Raises:
-        ValueError: a manoeuvre or the channel is missing.
-    """
+    """The five manoeuvres' drives, the figure-eight alone held out; ValueError where one or the channel is missing."""
     absent = [name for name in PAPER_MANOEUVRES if not any(trial.manoeuvre == name for trial in log.trials)]
     if absent:
         raise ValueError(f"log {log.name!r} has no trial of {absent[0]} (its manoeuvres: "

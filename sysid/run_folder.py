@@ -19,8 +19,7 @@ from whill_mjx.io.folders import claim_folder
 from whill_mjx.io.steps import keep_steps
 from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
-STEPS = "steps"
-"""Folder of the steps, in that of the run."""
+STEPS = "steps"  # folder of the steps, in that of the run
 
 
 @contextmanager
@@ -30,14 +29,10 @@ def run_folder(
     """Hold the folder of a run while the block fills it; its steps are kept until the block ends well.
 
     Args:
-        out: the folder, as given by --out.
         kind: the command, such as "sysid.fit".
         outputs: names that it writes besides the results that all commands share.
-        identity: name -> JSON value of what makes this run the same one. A folder that holds another is refused.
+        identity: name -> JSON value of what makes this run the same one; another is refused (FolderRefused).
         more: what the steps depend on besides, where the run may be given it later.
-
-    Raises:
-        FolderRefused: as of `claim_folder`, and of another run.
     """
     device = jax.devices()[0]
     machine = {"device": device.device_kind, "cores": cores(), "x64": bool(jax.config.values["jax_enable_x64"])}

@@ -76,6 +76,14 @@ def test_notebooks_have_the_code_of_the_pages(tmp_path):
             assert text.startswith("%%") == (block.language == "sh")
 
 
+@pytest.mark.quick
+@pytest.mark.skipif(not importlib.util.find_spec("nbclient"), reason="needs nbclient: pip install -e '.[docs]'")
+def test_a_cell_of_a_notebook_fails_with_any_of_its_lines(tmp_path):
+    page = page_of(tmp_path, "# Page\n\n```sh\nfalse\ntrue\n```\n")
+    with workplace(tmp_path), pytest.raises(RuntimeError, match="page.md as a notebook"):
+        tutorials.run_notebook(page)
+
+
 @pytest.mark.parametrize("name", QUICK)
 def test_the_quick_tutorials_run(name, tmp_path):
     with workplace(tmp_path):

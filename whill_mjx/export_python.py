@@ -265,7 +265,8 @@ def _key(name: str) -> str:
 
 
 def _head(spec: VehicleSpec, effects: Sequence[str], dt: float, about: dict[str, tuple[float, str]]) -> str:
-    table = "\n".join(f"    {name!r}: ({value!r}, {unit!r})," for name, (value, unit) in about.items())
+    table = "\n".join(f"    {name!r}: ({_literal(np.asarray(value))}, {unit!r}),"
+                      for name, (value, unit) in about.items())
     return f'''"""One physics step of {dt:g} s of a vehicle (NAME below), with its effects, in numpy alone.
 
     state = start(count=1000)                      # 1000 vehicles at rest at the origin

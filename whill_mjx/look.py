@@ -47,6 +47,8 @@ from whill_mjx.world.scene import box, footprint, stack_boxes
 
 VIDEOS = (".mp4", ".gif")
 """Endings of videos."""
+QUICKLY = {"xla_backend_optimization_level": 1}
+"""Of programs that run once: compiling takes longer than they do, and the picture is the same bit for bit."""
 RECORDING = ".rrd"
 """Ending of a recording for the Rerun viewer."""
 
@@ -87,7 +89,7 @@ def contact_sheet(env: Env, params: VehicleParams, worlds: int, steps: int, seed
         def begin(function, *args):
             """What the function of one world gives, as shapes, and the program of all, which is being compiled."""
             traced = jax.jit(jax.vmap(function)).trace(*args)
-            return traced.out_info, threads.submit(lambda: traced.lower().compile())
+            return traced.out_info, threads.submit(lambda: traced.lower().compile(compiler_options=QUICKLY))
 
         start, reset = begin(partial(reset_state, env, params), reset_keys)
         plan, first = begin(partial(first_plan, for_task(env.task), env), start, plan_keys)

@@ -65,15 +65,17 @@ CLAIMS = (
         "undeclared",
         "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
         "it. 1x is the "
-        'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns 2x and 4x '
-        "are of the present decision. The others are of the decision before it.",
-        ("figure", "2x", "4x", "2x, twice the noise", "4x, twice the noise", "4x, heavy scooter"),
+        'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns "fresh" are '
+        "of the present decision, on logs that nothing was chosen with; eight of them have backlash, which is never "
+        "named. Columns 2x and 4x have the logs that the weights were chosen with. The others are of the decision "
+        "before that.",
+        ("figure", "2x, fresh", "4x, fresh", "2x", "4x", "2x, noise x2", "4x, noise x2", "4x, heavy scooter"),
         tuple(
             (
                 label,
                 *(
                     f"{{{name}{kind}|{form}}}" if form else f"{{{name}{kind}}}"
-                    for kind in ("_2x", "_4x", "_2x_noise_2", "_4x_noise_2", "_4x_scooter")
+                    for kind in ("_2x_fresh", "_4x_fresh", "_2x", "_4x", "_2x_noise_2", "_4x_noise_2", "_4x_scooter")
                 ),
             )
             for label, name, form in (
@@ -95,8 +97,9 @@ CLAIMS = (
         MISSING,
         "False alarms and other checks of the verdict",
         "undeclared",
-        "The same logs. The weights were chosen with the false alarms in view. Effects taken out of the catalogue are "
-        "of the decision before the present one.",
+        "The same logs. Fresh ones are judged by the present decision, from evidence kept before its last change. The "
+        "weights were chosen with the others in view. "
+        "Effects taken out of the catalogue are of an earlier decision.",
         ("figure", "value"),
         (
             (
@@ -104,16 +107,28 @@ CLAIMS = (
                 "sets of reference days; upper 95 % bound",
                 "{false_alarm_upper|%}",
             ),
+            (
+                "false alarms, fresh logs, {false_alarms_fresh} of {false_alarms_fresh|.n} with nothing missing, "
+                "{false_alarms_fresh|.sets} sets of reference days; upper 95 % bound",
+                "{false_alarm_upper_fresh|%}",
+            ),
+            (
+                "the same at 0.5 to 4 times the noise, {false_alarms_noise_fresh} of {false_alarms_noise_fresh|.n}",
+                "{false_alarm_upper_noise_fresh|%}",
+            ),
             ("false alarms on 200 refitted simulated days of one log", "{refitted_null_alarms}"),
             ("Kolmogorov-Smirnov p-value of the calibrated p-values (uniform if large)", "{null_ks_p}"),
-            ("two effects at once, {pair_both|.n} logs: both named right", "{pair_both|%}"),
-            ("the same where both are at least at 2x, {pair_both_2x|.n} logs", "{pair_both_2x|%}"),
-            ("two effects at once: a wrong name", "{pair_wrong|%}"),
+            ("two effects at once, {pair_both_fresh|.n} fresh logs: both named right", "{pair_both_fresh|%}"),
+            ("the same: 95 % interval from", "{pair_both_fresh|.low %}"),
+            ("to", "{pair_both_fresh|.high %}"),
+            ("the same where both are at least at 2x, {pair_both_2x_fresh|.n} logs", "{pair_both_2x_fresh|%}"),
+            ("two effects at once, fresh logs: a wrong name", "{pair_wrong_fresh|%}"),
             ("effect taken out of the catalogue, 26 logs: `unexplained`", "{left_out_unexplained|%}"),
             ("the same: named outside its class", "{left_out_outside_class|%}"),
             ("the same: named wrong without a warning", "{left_out_wrong|%}"),
-            ("95 % intervals that hold the planted size, of {interval_coverage|.n}", "{interval_coverage|%}"),
-            ("error of the size, median", "{parameter_error|%}"),
+            ("95 % intervals that hold the planted size, of {interval_coverage_fresh|.n} in fresh logs",
+             "{interval_coverage_fresh|%}"),
+            ("error of the size, fresh logs, median", "{parameter_error_fresh|%}"),
             ("held-out error after naming, over the replicates' difference", "{heldout_ratio}"),
             ("numbers that decide", "{decision_thresholds}"),
             ("lines of code between kept evidence and verdict", "{decision_lines}"),

@@ -1,10 +1,9 @@
-"""What is minimised: the motion of drives in short bins, whitened by the noise that replicates or the fit itself leave.
+"""What is minimised: the motion of drives in short bins, whitened by the noise that replicates or the fit itself
+leave.
 
-Disturbances push a vehicle off its course, and a pose adds up all of them: errors of whole poses are correlated over a
-drive, and least squares of them let a few late ones outvote every other moment. Motion within a bin of a quarter
-of a second, seen from the vehicle itself, has errors that hardly reach beyond it; a vector autoregression makes them
-white (`sysid.errors.noise`), and where wheels are pulled hard, bins count by the noise that they have there. Least
-squares of those are generalised least squares: intervals are what curvature says. Source: Aitken (1936).
+A pose adds up all disturbances before it, so errors of whole poses are correlated over a drive. Errors of the motion
+within a quarter of a second hardly reach beyond it; a vector autoregression makes them white (`sysid.errors.noise`).
+Where wheels are pulled hard, bins count by the noise that they have there. Generalised least squares: Aitken (1936).
 """
 
 from __future__ import annotations
@@ -22,16 +21,14 @@ from sysid.errors.pose_objective import HUGE, Objective, Replays, append_prior
 from sysid.errors.prior import Prior
 from sysid.errors.space import STEP, Space
 from sysid.logs.records import Trial
-from sysid.replay.arrays import namespace
+from sysid.replay.arrays import Quotients, namespace
 from sysid.replay.cores import cores, on_processor
-from sysid.replay.quotients import Quotients
 from sysid.replay.records import Simulated
 from sysid.search import least_squares
 from whill_mjx.io.steps import steps_of_rows
 
 LONG = 8
-"""Bins of memory of the filter, where a log allows so much: the noise of a pose itself cancels from bin to bin, which a
-short memory takes for a vehicle that drifts."""
+"""Bins of memory of the filter: the noise of a pose cancels from bin to bin, which a short memory takes for a drift."""
 SETS = 64  # that a core replays between two saves: seconds for minutes of driving
 ROWS = 10  # times as many bins as the filter has coefficients in each row
 
@@ -43,14 +40,12 @@ class FeatureObjective:
     replay: Replays
     space: Space
     trials: tuple[Trial, ...]
-    track: float
-    """Of the vehicle [m]; shows how hard its wheels are pulled."""
+    track: float  # of the vehicle [m]; shows how hard its wheels are pulled
     features: Features
     target: np.ndarray  # (B, K, C) measured features
     mask: np.ndarray  # (B, K, C) weights of the bins
     whitener: Whitener
-    prior: Prior | None = None
-    """Its P residuals are the last ones of the first trial."""
+    prior: Prior | None = None  # its P residuals are the last ones of the first trial
 
     @property
     def enough(self) -> bool:
@@ -153,14 +148,9 @@ class FeatureObjective:
 
     def _white(self, at: np.ndarray) -> np.ndarray:
         xp = namespace(at)
-        white = self._apply(xp.where(xp.isfinite(at), at, 0.0) - self.target)
+        off = xp.where(xp.isfinite(at), at, 0.0) - self.target
+        white = xp.moveaxis(self.whitener.apply(xp.moveaxis(off, 0, -1), self.mask), -1, 0).reshape(*off.shape[:2], -1)
         return xp.where(_bad(at), HUGE * (self.mask > 0).reshape(len(self.mask), -1), white)
-
-    def _apply(self, series: np.ndarray) -> np.ndarray:
-        """White series (N, B, K C) of (N, B, K, C)."""
-        xp = namespace(series)
-        white = xp.moveaxis(self.whitener.apply(xp.moveaxis(series, 0, -1), self.mask), -1, 0)
-        return white.reshape(*white.shape[:2], -1)
 
 
 def _bad(at: np.ndarray) -> np.ndarray:
@@ -169,11 +159,7 @@ def _bad(at: np.ndarray) -> np.ndarray:
 
 
 def make_features_objective(objective: Objective, track: float) -> FeatureObjective:
-    """Errors in features of what an objective of poses compares, in the noise that replicates show.
-
-    Args:
-        track: of the vehicle [m].
-    """
+    """Errors in features of what an objective of poses compares, in the noise that replicates show; `track` in m."""
     features = make_features(objective.trials, bin_width(objective.trials))
     target = features.of(objective.measured)
     groups = replicate_groups(objective.trials)

@@ -1,8 +1,7 @@
-"""What is compared when the loop is closed: motion in short bins, seen from the vehicle itself.
+"""What is compared when the loop is closed: motion in short bins, in the frame that the vehicle had at the bin's
+start.
 
-A pose error grows along a drive and depends on everything before it. The motion within a bin, in the frame the vehicle
-had at the bin's start, does not: it needs no start pose, its noise is nearly stationary, and an effect shows in it at
-the time and place where it acts.
+It needs no start pose, its noise is nearly stationary, and an effect shows in it at the time and place where it acts.
 """
 
 from __future__ import annotations
@@ -20,18 +19,15 @@ BIN = 0.25  # s
 CHANNELS = ("odometry.v", "odometry.omega", "pose.forward", "pose.left", "pose.yaw")
 """Mean reported speeds, and displacement over a bin divided by its length [m/s, rad/s].
 
-The pose that the odometry adds up is left out: where a vehicle updates it in steps of its own clock, those steps would
-be taken for motion. Where rows are at the times of those steps it is exact to a fraction of a millimetre, more than any
-model of skidding wheels: fits with it foretold held-out drives worse (docs/fit.md)."""
-GYRO = "gyro.omega"
-"""Mean yaw rate of a gyro in a bin [rad/s]: a channel where a log has one."""
+Without the pose that the odometry adds up: its updates come in steps of its own clock, and fits with it foretold
+held-out drives worse (docs/fit.md).
+"""
+GYRO = "gyro.omega"  # mean yaw rate of a gyro in a bin [rad/s]: a channel where a log has one
 MAX_GAP = 0.6  # of a bin: a longer gap between samples leaves the bins it touches unmeasured
 LONG_AGO = -1e6  # s
 MAX_WIDE_GAP = 1.0  # the same of wider bins, where the outside pose comes seldom anyway
-WIDER = (2.0, 4.0)
-"""How many times wider bins may be where an outside pose comes too seldom for them."""
-ENOUGH = 0.7
-"""Least share of the bins between its first and last sample that an outside pose must measure."""
+WIDER = (2.0, 4.0)  # how many times wider bins may be where an outside pose comes too seldom for them
+ENOUGH = 0.7  # least share of the bins between its first and last sample that an outside pose must measure
 
 
 @dataclass(frozen=True)
@@ -61,8 +57,7 @@ class Features:
     start: np.ndarray  # (B, 3) pose at t = 0, the sample before the first one where it is a measurement
     mask: np.ndarray  # (B, K, C) 1 where measured
     middle: np.ndarray  # (K,) time of each bin's middle [s]
-    gyro: _Edges | None = None
-    """None where no gyro is a channel."""
+    gyro: _Edges | None = None  # none where no gyro is a channel
 
     def of(self, values: Measured | Simulated) -> np.ndarray:
         """Features (..., B, K, C); what was not measured is 0."""
@@ -116,11 +111,7 @@ def pose_times(trial: Trial) -> np.ndarray:
 
 
 def make_features(trials: tuple[Trial, ...], width: float = BIN, gyro: bool | None = None) -> Features:
-    """The feature map of trials that are padded as in `sysid.replay.rollout.make_batch`.
-
-    Args:
-        gyro: whether a gyro is a channel; by default where a trial has one.
-    """
+    """Feature map of trials padded as by `make_batch`; with a gyro channel by default where a trial has one."""
     bins = max(int(np.floor(trial.duration / width + 1e-6)) for trial in trials)
     edge = np.arange(bins + 1) * width
     start = np.array([[t.start.x, t.start.y, t.start.yaw] for t in trials])

@@ -1,8 +1,7 @@
 """Costs and normal equations of many parameter sets at once, computed where the replay runs.
 
-Residuals of thousands of replays are larger than what they are wanted for: a cost, a gradient and a Hessian for each
-set. On an accelerator they are whitened, differenced and summed there, in one compiled function with the replay, so
-that only those sums come back.
+On an accelerator residuals are whitened, differenced and summed in one compiled function with the replay, so that only
+a cost, a gradient and a Hessian of each set come back.
 """
 
 from __future__ import annotations
@@ -15,17 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import STEP, Space
+from sysid.errors.space import STEP, Space, huber_weight, robust_cost
+from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_processor
-from sysid.replay.quotients import Quotients
 from sysid.replay.records import Simulated
 
 DRIVES = 32768
 """Drives replayed by one call, as near as sets allow: an accelerator takes as long for a few (an H100 0.30 s for 2,000,
 0.33 s for these), and each number is compiled once."""
-STATES = 2**27
-"""States recorded by one call at most: 5 GB, several times as much with what is made of them."""
+STATES = 2**27  # states recorded by one call at most: 5 GB, several times as much with what is made of them
 SEARCHES, FEW = 32, 8
 """Sets whose gradients and Hessians are made together: as many at least as a search has starts, and so few where no
 more of them go on, or where it has a single one."""
@@ -140,8 +137,7 @@ def summed_there(replay: Any) -> bool:
 
 
 def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) -> None:
-    """Let an accelerator compile side by side what a search by these objectives will need, and what it fetches of a
-    replay with values (P,); a processor compiles in seconds what it comes to."""
+    """Compile side by side what a search by these objectives needs of a replay with values (P,), on an accelerator."""
     if summed_there(replay):
         _COMPILERS.submit(replay.simulate, values[None])
         for objective in objectives:

@@ -1,9 +1,8 @@
 """What is minimised: the paper's J (sum of position RMSE), and a weighted least-squares residual over all channels.
 
-The residual of a channel is divided by its noise scale: the spread between replicates where the log has them, else a
-stated default that is replaced by the residual's own size after a first fit. The start pose of a trial is itself
-measured with noise; its three errors enter the residual linearly, so they are solved for in closed form with that
-noise as prior.
+A channel's residual is divided by its noise scale: the spread between replicates, else a default that the residual's
+own size replaces after a first fit. The three errors of a measured start pose enter linearly and are solved for in
+closed form, with that noise as prior.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ import numpy as np
 
 from sysid.errors.normal_equations import NormalEquations, make_equations, summed_there
 from sysid.errors.prior import Prior
-from sysid.errors.robust import huber_weight
-from sysid.errors.space import Residuals, Space
+from sysid.errors.space import Residuals, Space, huber_weight
 from sysid.logs.metrics import replicate_noise
 from sysid.logs.records import Trial
 from sysid.replay.arrays import added, namespace
@@ -42,8 +40,7 @@ class Noise:
     pose: np.ndarray  # (3,)
     odometry: np.ndarray  # (5,)
     source: str  # "replicates", "defaults" or "residuals"
-    gyro: float | None = None
-    """Of a gyro's mean rate between two samples [rad/s]; None where no trial has one."""
+    gyro: float | None = None  # of a gyro's mean rate between two samples [rad/s]; None where no trial has one
 
     def as_dict(self) -> dict[str, float]:
         names = ["ground_truth.x", "ground_truth.y", "ground_truth.yaw",
@@ -101,8 +98,7 @@ class Objective:
     trials: tuple[Trial, ...]
     measured: Measured
     noise: Noise
-    prior: Prior | None = None
-    """Its P residuals are the last ones of the first trial."""
+    prior: Prior | None = None  # its P residuals are the last ones of the first trial
 
     @property
     def counted(self) -> int:
@@ -122,8 +118,7 @@ class Objective:
 
     @cached_property
     def _rates(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Of the gyro's samples, one over the time between each and the next (B, G - 1, 1), and 1 where both are there;
-        None without a gyro."""
+        """One over the time between samples of the gyro (B, G - 1, 1), and 1 where both are there; None without one."""
         one = self.measured
         if one.gyro_t is None or one.gyro_mask is None or self.noise.gyro is None:
             return None
@@ -223,8 +218,7 @@ class Objective:
         return np.concatenate([piece, np.arange(pairs) * count // max(pairs, 1)])
 
     def own_frame(self, residual: np.ndarray) -> np.ndarray:
-        """(B, K) residuals of pose, odometry and gyro; those of the outside position along and across the start's
-        heading."""
+        """(B, K) residuals of pose, odometry and gyro; the outside position along and across the start's heading."""
         tables = (self.measured.pose, self.measured.odometry)
         sizes = [table[0].size for table in tables]
         pose = residual[:, : sizes[0]].reshape(tables[0].shape)
@@ -253,7 +247,8 @@ class Objective:
         if self._rates is None or simulated.gyro is None:
             return None
         error = np.abs(np.diff(np.asarray(simulated.gyro[0]) - self.measured.gyro, axis=1) * self._rates[0])
-        known = error[self._rates[1] > 0]
+        there = self._rates[1] > 0
+        known = error[there] / self._rates[1][there]  # whatever the drives weigh
         return max(1.4826 * float(np.median(known)), MIN_NOISE) if len(known) else self.noise.gyro
 
     def bad(self, simulated: Simulated) -> Any:
@@ -297,9 +292,8 @@ class Objective:
         """Residual and Jacobian after the best start-pose error of each trial, with that error itself appended.
 
         A start error n = (dx, dy, dyaw) moves the simulated pose by A n; n minimises |r + A n|^2 + |n / sigma|^2, a
-        linear map of r that is applied to the Jacobian as well. Samples that are far off (`gradient.HUBER`) weigh less
-        in it: one start must not follow them, when all samples suffer from it. The odometry, which is counted from its
-        own standstill, has such an error of its own.
+        linear map of r that is applied to the Jacobian as well. Samples that are far off (`robust.HUBER`) weigh less in
+        it. The odometry, which is counted from its own standstill, has such an error of its own.
         """
         noise, starts = self.noise, [trial.start for trial in self.trials]
         begin, xp = 0, namespace(simulated.pose)
@@ -337,13 +331,7 @@ class _StartError:
 
     @classmethod
     def of(cls, values: Any, origin: np.ndarray, weight: np.ndarray, residual: Any) -> _StartError:
-        """That of poses.
-
-        Args:
-            values: (N, B, M, C) of which the first three columns are x, y, yaw.
-            origin: (B, 2) where they start.
-            weight: (B, M, C).
-            residual: (N, B, M C) whitened.
+        """That of poses: values (N, B, M, C) of x, y, yaw, ...; origin (B, 2); weight (B, M, C); residual (N, B, M C).
         """
         arm = namespace(values).nan_to_num(values[..., :2] - origin[:, None, :])
         return cls(arm, weight, huber_weight(residual.reshape(values.shape)[..., :3]))

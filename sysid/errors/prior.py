@@ -1,8 +1,7 @@
 """What is known of a vehicle before its log is fitted: the bounds of its parameters, or a vehicle file.
 
-A parameter of which a log says next to nothing would follow folds of the cost to an end of its range, and take along
-what is determined only together with it. Bounds alone, as a normal distribution as wide as they are, hold it back; what
-a log determines they hardly move.
+A parameter of which a log says next to nothing would follow folds of the cost to an end of its range. A normal
+distribution as wide as its bounds holds it back; what a log determines is hardly moved.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ EXPECTED = {
     "wheels.difference": 0.02, "odometry_scale.linear": 0.03, "odometry_scale.angular": 0.05,
     "pose_mount.x": 0.2, "pose_mount.y": 0.2, "pose_mount.yaw": 0.2, "gyro_bias.bias": 0.02, "gyro_bias.scale": 0.02,
 }
-"""How far data sheets, rulers and hand-drawn markers are usually off: standard deviations around where a parameter does
-nothing, of those whose bounds say much less."""
+"""How far data sheets, rulers and hand-drawn markers are usually off (standard deviations), if bounds say less."""
 RELATIVE = {"wheels.radius": 0.03, "wheels.track": 0.05}  # the same as shares of what a robot file says
 QUANTILE = 1.645  # of the normal distribution, of the 90 % intervals in vehicle files
 
@@ -70,11 +68,8 @@ def expected_sd(space: Space) -> np.ndarray:
 
 
 def make_prior(space: Space, intervals: Mapping[str, tuple[float, float]], spread: float = SPREAD) -> Prior:
-    """Prior around the space's initial values.
-
-    A parameter with an interval is known that well, and may differ by `spread` of its value on another day. One
-    without was not determined by its log, and only its bounds are known.
-    """
+    """Prior around the space's initial values: a parameter with an interval is known that well, and may differ by
+    `spread` of its value on another day; of the others only the bounds are known."""
     mean = space.to_unit(space.initial)
     slope = np.maximum(space.slope(mean), 1e-12)
     sd = expected_sd(space)

@@ -1,4 +1,4 @@
-"""Which parameters are searched, between which bounds, and on which scale.
+"""Which parameters are searched, between which bounds and on which scale, and how much large residuals count.
 
 The search runs in unit coordinates u in [0, 1]: linear, or logarithmic where the range spans more than a factor of 10.
 """
@@ -14,8 +14,7 @@ import numpy as np
 from sysid.replay.arrays import namespace
 from whill_mjx.vehicle.specs import VehicleSpec
 
-STEP = 0.01
-"""Half the distance between the two ends of a difference, as a share of the parameter's range."""
+STEP = 0.01  # half the distance between the two ends of a difference, as a share of the parameter's range
 
 LOG_SPAN = 10.0
 # Parameters that no driving log determines, or that only act through another one; they keep their value unless named.
@@ -28,8 +27,7 @@ FIXED = {
 }
 NUISANCE = {
     "torque_drive.period": "this log cannot determine it; it is free so that it does not bias the others",
-}
-"""Searched, but never reported as determined: what its curvature at one point says holds nowhere else."""
+}  # searched, but never reported as determined: what its curvature at one point says holds nowhere else
 BENT = ("body.com_z",)
 """A log determines them better or worse by their own value: the load that driving shifts goes with the height."""
 LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns show how high the mass lies
@@ -47,12 +45,9 @@ PER_INERTIA = ("torque_drive.kp", "torque_drive.ki", "torque_drive.limit", "torq
 class Turned:
     """What one side's motor turns, from the nominal vehicle."""
 
-    mass: float
-    """Inertia of half of the vehicle, at the wheel [kg m^2]."""
-    wheel: float
-    """Nominal spin inertia of the wheels of one side [kg m^2]."""
-    yaw: float
-    """By how many times a wheel's spin inertia the vehicle is harder to turn about its vertical axis [-]."""
+    mass: float  # inertia of half of the vehicle, at the wheel [kg m^2]
+    wheel: float  # nominal spin inertia of the wheels of one side [kg m^2]
+    yaw: float  # by how many times a wheel's spin inertia the vehicle is harder to turn about its vertical axis [-]
     driven: float
     """Where the driven wheels are in the chassis frame [m]: centrifugal force shows how far before them the mass is."""
 
@@ -77,10 +72,8 @@ class Space:
     high: np.ndarray  # (P,)
     initial: np.ndarray  # (P,)
     log: np.ndarray  # (P,) bool
-    fixed: tuple[tuple[str, str], ...] = ()
-    """Names that keep their value, each with the reason."""
-    turned: Turned | None = None
-    """Of the vehicle, where it is one."""
+    fixed: tuple[tuple[str, str], ...] = ()  # names that keep their value, each with the reason
+    turned: Turned | None = None  # of the vehicle, where it is one
 
     def __post_init__(self) -> None:
         for name, low, high, value in zip(self.names, self.low, self.high, self.initial, strict=True):
@@ -118,12 +111,11 @@ class Space:
         return np.where(self.log, self.to_values(u) * np.log(high / low), self.high - self.low)
 
     def moved(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Unit coordinates (N, P), which may lie outside the range, a step (N, P) from u (N, P): along the valley of
-        all that drives fix per inertia.
+        """Unit coordinates (N, P) a step (N, P) from u (N, P), along the valley of what drives fix per inertia only.
 
         Heavier wheels with as much larger torques drive alike. Torques grow in proportion to an inertia of which the
-        wheels' is one of two terms: in these coordinates that valley is curved, the more so the lighter the vehicle,
-        and a straight step of one standard error leads far up its sides. To first order the step is as it is.
+        wheels' is one of two terms, so that valley is curved, and a straight step leads far up its sides. The first
+        order is unchanged.
         """
         end = u + step
         if self.turned is None or RATIO not in self.names:
@@ -161,8 +153,8 @@ LOSS = 1.5  # 1/s by which bearings may brake a vehicle that rolls, or a feed-fo
 
 
 def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec) -> dict[str, tuple[float, float]]:
-    """Bounds that follow the vehicle: its torques, scrub up to its whole weight sliding at a quarter of the track, and
-    a centre of mass between the axles, above the floor and below where a turn at a third of g would tip it."""
+    """Bounds that follow the vehicle: its torques, scrub up to its whole weight sliding at a quarter of the track,
+    and a centre of mass between the axles, above the floor and below where a turn at a third of g would tip it."""
     scaled = {name: (FACTORS[name][0] * value, FACTORS[name][1] * value)
               for name, value in zip(names, initial, strict=True) if name in FACTORS and value > 0}
     load = spec.mass / 2 * spec.wheel_radius**2 + spec.wheel_inertia  # [kg m^2] that one side's motor turns
@@ -176,8 +168,7 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
 def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
     """What a fit searches by default: all but `FIXED`, and the height of the mass where wheels may skid.
 
-    Args:
-        asked: effects that were asked for; lateral damping of driven wheels, which slip besides, is searched only then.
+    `asked`: effects asked for; lateral damping of driven wheels, which slip besides, is searched only then.
     """
     from whill_mjx.vehicle.parameters import describe
 
@@ -191,12 +182,10 @@ def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
 
 
 def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:
-    """Space of a vehicle's parameters, with their described bounds or those of `vehicle_bounds`.
+    """Space of a vehicle's parameters, from their values in `params`, with their described bounds or
+    `vehicle_bounds`.
 
-    Args:
-        params: `VehicleParams`; their values are where the search starts.
-        spec: its nominal geometry and mass.
-        names: what to search; by default everything but `FIXED` and limits that are not there.
+    `names`: what to search; by default everything but `FIXED` and limits that are not there.
     """
     from whill_mjx.vehicle.parameters import describe, get_values
 
@@ -223,10 +212,7 @@ def is_delay(name: str) -> bool:
 
 
 class Residuals(Protocol):
-    """What is minimised: residuals (N, B, K) of unit coordinates (N, P), and their derivatives (N, B, K, P).
-
-    One whose `equations` are not None has them summed up there.
-    """
+    """Residuals (N, B, K) of unit coordinates (N, P), and derivatives (N, B, K, P), or what `equations` sum up."""
 
     @property
     def space(self) -> Space: ...
@@ -237,3 +223,26 @@ class Residuals(Protocol):
     def residuals(self, u: np.ndarray) -> np.ndarray: ...
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+HUBER = 4.0  # noise scales beyond which a robust fit counts a residual linearly
+
+
+def huber_weight(residual: Any) -> Any:
+    """Weight of the squares whose minimum is that of the Huber loss."""
+    xp = namespace(residual)
+    return xp.minimum(1.0, HUBER / xp.maximum(xp.abs(residual), 1e-12))
+
+
+def robust_cost(residual: Any, robust: Any) -> Any:
+    """Sum (N,) of squares, or of the Huber loss, over residuals (N, B, K). `robust` may be traced."""
+    return robust_loss(residual, robust).sum((-1, -2))
+
+
+def robust_loss(residual: Any, robust: Any) -> Any:
+    """Squares of residuals, or their Huber losses; `robust` as of `robust_cost`."""
+    xp = namespace(residual)
+    if robust is False:
+        return xp.square(residual)
+    size = xp.abs(residual)
+    return xp.where((size > HUBER) & robust, 2 * HUBER * size - HUBER**2, size**2)

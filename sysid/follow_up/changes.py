@@ -7,34 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.metrics import METRICS, UNITS
+from sysid.logs.metrics import METRICS, UNITS, errors_of
 from sysid.logs.records import Prediction, Trial
 
-BLOCK = 2.0
-"""Length of the blocks that are drawn within a trial [s]: longer than what errors of speed remember."""
+BLOCK = 2.0  # length of the blocks that are drawn within a trial [s]: longer than what errors of speed remember
 RESAMPLES = 1000
 
-Squares = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]
-"""channel -> metric -> times (T,) and squared errors (T,)."""
+Squares = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]  # channel -> metric -> times (T,) and squared errors (T,)
 
 
 def squared_errors(trial: Trial, prediction: Prediction) -> Squares:
     """The squares whose mean over a trial is the square of `sysid.logs.metrics.score`."""
-    out: Squares = {}
-    truth, simulated = trial.ground_truth, prediction.ground_truth
-    if truth is not None and simulated is not None:
-        out["ground_truth"] = {
-            "trajectory": (truth.t, np.square(simulated.x - truth.x) + np.square(simulated.y - truth.y)),
-            "yaw": (truth.t, np.square(simulated.yaw - truth.yaw))}
-    seen, replayed = trial.odometry, prediction.odometry
-    if seen is not None and replayed is not None:
-        mine = {"velocity": np.square(replayed.v - seen.v), "angular_velocity": np.square(replayed.omega - seen.omega)}
-        if seen.x is not None and seen.y is not None and seen.yaw is not None:
-            assert replayed.x is not None and replayed.y is not None and replayed.yaw is not None
-            mine["trajectory"] = np.square(replayed.x - seen.x) + np.square(replayed.y - seen.y)
-            mine["yaw"] = np.square(replayed.yaw - seen.yaw)
-        out["odometry"] = {metric: (seen.t, values) for metric, values in mine.items()}
-    return out
+    return {channel: {metric: (t, np.square(error)) for metric, (t, error) in mine.items()}
+            for channel, mine in errors_of(trial, prediction).items()}
 
 
 def by_manoeuvre(
@@ -42,10 +27,8 @@ def by_manoeuvre(
 ) -> list[dict[str, Any]]:
     """Mean RMSE of each manoeuvre, channel and metric before and after, training and held-out trials apart.
 
-    Returns:
-        Rows of `part`, `manoeuvre`, `channel`, `metric`, `unit`, `before`, `after`, `change`, its 95 % `interval`,
-        `trials`. Intervals are those of trials drawn anew and of blocks of `BLOCK` within each, before and after of a
-        block together.
+    Rows of `part`, `manoeuvre`, `channel`, `metric`, `unit`, `before`, `after`, `change`, its 95 % `interval` and
+    `trials`. Intervals are those of trials drawn anew and of blocks of `BLOCK` within each.
     """
     rng = np.random.default_rng(seed)
     pairs = [(trial, squared_errors(trial, one), squared_errors(trial, other))
@@ -70,11 +53,7 @@ def worse(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def paired(trials: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], rng: np.random.Generator) -> dict[str, Any]:
-    """Mean RMSE before and after, and the interval of the change.
-
-    Args:
-        trials: of each the times (T,), and the squared errors (T,) before and after.
-    """
+    """Mean RMSE before and after, and the interval of its change, from times (T,) and squared errors (T,) of trials."""
     ends = np.array([[np.sqrt(one[1].mean()), np.sqrt(one[2].mean())] for one in trials]).mean(0)
     drawn = np.stack([_drawn(*one, rng) for one in trials])  # (trials, RESAMPLES)
     picked = rng.integers(0, len(trials), (len(trials), RESAMPLES))

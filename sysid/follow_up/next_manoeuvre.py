@@ -1,10 +1,10 @@
 """The next drive: the one that separates effects which these drives do not.
 
 Rivals are an accepted effect, the others of its class, and those whose refit came close to it. Each is simulated at its
-own fitted values on every drive of a library. From the difference of two, what base parameters within their day-to-day
-spread and the other's own coordinates can absorb is projected out; what is left, in standard deviations of the noise,
-is how well a drive separates them. The drive with the largest worst case is proposed. All drives last as long as the
-log's longest trial: they go through the replay that the search has compiled.
+own fitted values on every drive of a library. What base parameters within their spread and the other's own coordinates
+can absorb is projected out of the difference of two; the rest, in standard deviations of the noise, is how well a drive
+separates them. The drive with the largest worst case is proposed; all last as long as the log's longest trial, so that
+they go through the replay that is compiled.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sysid.missing.joint_fit import Start as FitStart
 from sysid.missing.refit import Refitter, own_sizes
 from sysid.missing.signatures import base_columns
 from sysid.pages.loop_words import command_of
-from sysid.replay.quotients import Quotients
+from sysid.replay.arrays import Quotients
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import refitter_of
 from whill_mjx.effects import EFFECTS, card_of
@@ -35,15 +35,12 @@ from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL
 
 FILE = "next_command.csv"
-TIE = 0.2
-"""A refit whose gain falls short of the best one's by less than this share is a rival."""
+TIE = 0.2  # A refit whose gain falls short of the best one's by less than this share is a rival
 LEAST, ENOUGH = 3.0, 5.0
 """Standard deviations from which a drive counts as telling two effects apart, and that repetitions should reach."""
 MOST_REPEATS = 9
-SIZES = (1.0, 0.5, 0.2)
-"""Shares of the log's largest speed and yaw rate that every manoeuvre is tried at."""
-HEADINGS = (0.0, 90.0, 180.0, 270.0)
-"""Start headings [degrees] that are tried where a rival is fixed in the room."""
+SIZES = (1.0, 0.5, 0.2)  # shares of the log's largest speed and yaw rate that every manoeuvre is tried at
+HEADINGS = (0.0, 90.0, 180.0, 270.0)  # start headings [degrees] that are tried where a rival is fixed in the room
 FRACTIONS = (1.0, 0.75, 0.5, 0.35, 0.2)  # of the time in motion, where the room is too small
 REFINED = 24  # drives for which the absorbed part is computed as well
 POLISH = 3  # iterations of the refit of a rival that the search has not refitted
@@ -54,16 +51,11 @@ class PlannedDrive:
     """One drive of the library: a manoeuvre and how it is driven."""
 
     manoeuvre: str
-    v: float
-    """Speed [m/s]."""
-    omega: float
-    """Yaw rate [rad/s]."""
-    seconds: float
-    """Time in motion [s]."""
-    start: tuple[float, float, float]
-    """x, y [m] and heading [rad] in the room."""
-    dt: float = 0.1
-    """Command period [s]."""
+    v: float  # speed [m/s]
+    omega: float  # yaw rate [rad/s]
+    seconds: float  # time in motion [s]
+    start: tuple[float, float, float]  # x, y [m] and heading [rad] in the room
+    dt: float = 0.1  # command period [s]
 
     @property
     def command(self) -> Command:
@@ -133,8 +125,7 @@ def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[
 
 
 def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[PlannedDrive]:
-    """The library: every manoeuvre at several sizes and start headings [degrees], within the speeds, the space and the
-    time that the training trials took up."""
+    """Every manoeuvre at several sizes and start headings [degrees], within speeds, space and time of the training."""
     trials = result.log.training
     v = max(max(float(trial.command.v.max()) for trial in trials), 0.1)
     omega = max(float(np.abs(trial.command.omega).max()) for trial in trials) or min(result.log.spec.omega_max, 0.5)
@@ -217,8 +208,7 @@ def plan_drives(result: Result, drives: Drives, library: Sequence[PlannedDrive])
 def separations(
     result: Result, refitter: Refitter, groups: Sequence[Sequence[Rival]], library: Sequence[PlannedDrive]
 ) -> tuple[np.ndarray, list[PlannedDrive]]:
-    """Separation (D, pairs) of the most promising drives, and these drives; pairs as in `itertools.combinations` of
-    each group in turn."""
+    """Separation (D, pairs) by the most promising drives, and these drives; pairs as `combinations` of each group."""
     flat = [one for group in groups for one in group]
     place = {id(one): i for i, one in enumerate(flat)}
     pairs = [(place[id(a)], place[id(b)]) for group in groups for a, b in combinations(group, 2)]
@@ -267,8 +257,7 @@ def _own_columns(refitter: Refitter, drives: Drives, fit: Refit, at: np.ndarray)
 
 
 def _held(result: Result, fit: Refit) -> np.ndarray:
-    """(P + k, P + k) precision of a rival on a new day: base parameters by the spread, its coordinates by these drives
-    and by how far they seem to wander from day to day."""
+    """(P + k, P + k) precision of a rival on a new day: base by the spread, coordinates by drives and wander."""
     size = len(fit.u)
     flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
     matrix = flat.T @ flat

@@ -1,15 +1,25 @@
-"""What these very drives can show: how often they raise a false alarm, and how surely an effect is noticed.
+"""What these very drives can show: how often they raise a false alarm, how surely an effect is noticed, and
+what a p-value of the search comes to where nothing is missing.
 
 Days with nothing missing are simulated as the nulls of the scan are, but drawn anew; an effect adds its columns.
 Linear, like the scan: `--refit-nulls` measures the false alarms of the whole procedure.
+
+The p-value of the search assumes that drives differ from the reference days as these do from each other. Real days do
+so only roughly: small values come too often, and those that a refit takes back end at 1. On logs of an independent
+plant with nothing in them they follow a Beta distribution (`benchmarks.undeclared --calibrate` fits it), whose
+distribution function makes them uniform there. It decides nothing: verdicts go by the p-values of the search.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
@@ -22,12 +32,10 @@ DRAWS = 200
 SEED = 3  # beside that of the scan's nulls
 POWER = 0.8
 REACH, HALVINGS = 8.0, 7  # range of factors around a first guess, and how often it is halved
-FACTORS = (0.25, 0.5, 1.0, 2.0)
-"""Sizes of a named effect, over the fitted one, whose power is reported."""
+FACTORS = (0.25, 0.5, 1.0, 2.0)  # sizes of a named effect, over the fitted one, whose power is reported
 
 
-Effect = tuple[Columns, np.ndarray]
-"""Columns of a hypothesis and its coordinates (k,)."""
+Effect = tuple[Columns, np.ndarray]  # columns of a hypothesis and its coordinates (k,)
 
 
 @dataclass(frozen=True)
@@ -37,8 +45,7 @@ class Days:
     evidence: Evidence
     hypotheses: Sequence[Hypothesis]
     wander: Wander
-    scan: Scan
-    """That was run on this evidence."""
+    scan: Scan  # that was run on this evidence
     nulls: NullDays
 
     def p(self, effects: Sequence[Effect] = ()) -> np.ndarray:
@@ -80,11 +87,7 @@ def power_curve(days: Days, hypothesis: int, q: np.ndarray, alpha: float) -> lis
 
 
 def smallest(days: Days, alpha: float, effects: Sequence[Effect]) -> list[tuple[float, float]]:
-    """Of each effect the factor on its size at which it is noticed with 80 % power, by bisection, and its power there.
-
-    Args:
-        effects: at sizes near which that is expected; factors from 1 / `REACH` to `REACH` are looked at.
-    """
+    """Of each effect the factor on its size (within `REACH`) at which it is noticed with 80 % power, and its power."""
     low, high = np.full(len(effects), 1 / REACH), np.full(len(effects), REACH)
     power = np.ones(len(effects))
     for number in range(HALVINGS + 1):
@@ -94,3 +97,18 @@ def smallest(days: Days, alpha: float, effects: Sequence[Effect]) -> list[tuple[
         if number < HALVINGS:
             low, high = np.where(power < POWER, factor, low), np.where(power < POWER, high, factor)
     return [(float(factor), float(share)) for factor, share in zip(high, power, strict=True)]
+
+
+FILE = Path(__file__).parents[1] / "data/null_p.json"  # the shape of the distribution, and the logs that it rests on
+
+
+def calibrated(p: float) -> float:
+    """Share of days with nothing missing on which the search has a p-value as small as this one."""
+    return float(stats.beta.cdf(p, *shape()))
+
+
+@cache
+def shape() -> tuple[float, float]:
+    """a and b of the Beta distribution that p-values follow where nothing is missing; 1 and 1 would be uniform."""
+    content = json.loads(FILE.read_text())
+    return float(content["a"]), float(content["b"])

@@ -12,12 +12,9 @@ from sysid.verdict.agreement import with_prior
 from sysid.verdict.result import Result
 
 CONFIDENCE = 0.95
-FOLLOWED = 0.9
-"""Largest share of a direction's information in one manoeuvre with which its residual is enlarged."""
-NEARLY = 0.9
-"""Share of the largest size that is looked for from which a size is at its end."""
-MOVED = 0.01
-"""p-value of how far base parameters went, below which they went further than from day to day."""
+FOLLOWED = 0.9  # largest share of a direction's information in one manoeuvre with which its residual is enlarged
+NEARLY = 0.9  # share of the largest size that is looked for from which a size is at its end
+MOVED = 0.01  # p-value of how far base parameters went, below which they went further than from day to day
 LAW = ("speed", "yaw rate", "size of the step")
 """Quantities by which effects that act at the same times have different laws."""
 UNDONE = 0.5
@@ -38,8 +35,7 @@ class Doubt:
     text: str
     remedy: str
     about_rest: bool = False
-    """Whether it is about what the named effects leave, which does not matter where drives are predicted as well as
-    they repeat."""
+    """Whether it is about what the named effects leave, which does not matter where drives are predicted well."""
 
 
 def warnings(result: Result) -> list[str]:
@@ -50,8 +46,7 @@ def warnings(result: Result) -> list[str]:
 def advice(result: Result, as_good_as_repeats: bool) -> list[str]:
     """Of the doubts those that change what a reader should do, each with what that is.
 
-    Args:
-        as_good_as_repeats: with the named effects, drives are predicted to within what repeats differ by.
+    `as_good_as_repeats`: with the named effects, drives are predicted to within what repeats differ by.
     """
     return [f"{one.text[0].upper()}{one.text[1:]}. {one.remedy}" for one in doubts(result)
             if not (one.about_rest and as_good_as_repeats)]
@@ -123,8 +118,8 @@ def at_the_end(result: Result) -> list[str]:
 def beside_still_base(result: Result, iterations: int = 8) -> list[Refit]:
     """The final effects fitted beside base parameters that hardly move; nothing where these moved as days do.
 
-    Where the form is not quite right, base parameters go further than from day to day to mend it, and take a part of
-    the effect along or give it one. How much lies between this fit and the final one.
+    Base parameters that mend a form which is not quite right take a part of the effect along or give it one: how much
+    lies between this fit and the final one.
     """
     from scipy import stats
 

@@ -1,10 +1,9 @@
 """A wrench without a name for what the catalogue does not have.
 
 A force along the vehicle and a torque about it, as tables over one quantity of the motion, are fitted to what the base
-model leaves. Each knot of a table is switched on by itself at a small size; what that changes in the features is its
-column. The table is a linear regression of the white residual on these columns beside those of the base parameters.
-Which quantity, how smooth, and which sum of few terms stands for the table: manoeuvres that were held back decide. The
-winner is then replayed as the effect `unnamed`. A table over a wheel's angle starts at its own angle in every drive.
+model leaves: a linear regression of the white residual on what each knot changes, beside the base parameters.
+Manoeuvres that were held back decide which quantity, how smooth, and which sum of few terms stands for the table. The
+winner is replayed as the effect `unnamed`. A table over a wheel's angle starts at its own angle in every drive.
 """
 
 from __future__ import annotations
@@ -18,20 +17,22 @@ import numpy as np
 
 from sysid.follow_up.wrench_tables import (
     Products,
+    Term,
     WrenchTable,
+    columns_of,
     few_terms,
     from_first_wave,
     held_back,
+    in_words,
     multiplied,
     penalties,
     turned,
 )
-from sysid.follow_up.wrench_terms import Term, columns_of, in_words
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.drives import RECORD_DT, Drives, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
+from sysid.replay.arrays import Quotients
 from sysid.replay.models import with_effects
-from sysid.replay.quotients import Quotients
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import Replay, make_batch, predictions
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
@@ -42,18 +43,15 @@ from whill_mjx.effects.unnamed import KNOTS, MAP, PERIODIC, QUANTITIES
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.types import VehicleParams
 
-KINDS = ("push", "brake")
-"""A wrench whatever the motion, or one that turns with its direction."""
+KINDS = ("push", "brake")  # A wrench whatever the motion, or one that turns with its direction
 ROOM = ("heading in the room", "x in the room", "y in the room", MAP)
 """Quantities that only an outside pose shows; replicates, which start elsewhere, differ in them."""
 REST_RANGE = {"time since rest": 4.0, "distance since rest": 0.6}
 FINALISTS = 3  # tables that are fitted to all trials, not to one of each manoeuvre alone
-LEAST = 0.1
-"""Least share of the excess residual that a table must predict on held-back manoeuvres."""
+LEAST = 0.1  # least share of the excess residual that a table must predict on held-back manoeuvres
 LEAST_GAIN = 25.0
 """Least lowering of their squared white residual: the best of all tables reached 16 in eight draws of noise."""
-COMPACT = 0.75
-"""Share of the table's held-back gain that few terms must reach to stand for it."""
+COMPACT = 0.75  # share of the table's held-back gain that few terms must reach to stand for it
 CHOICES = tuple(Try(1.0, share) for share in (1.0, 0.5, 0.2))
 ROUNDS = 3  # Gauss-Newton steps
 
@@ -76,20 +74,13 @@ class Unnamed:
 
     table: WrenchTable
     wrench: np.ndarray  # (2 KNOTS,) forces [N], then torques [N m]
-    terms: tuple[Term, ...]
-    """The sum that stands for the tables; none where no compact one does."""
-    coefficients: tuple[np.ndarray, ...]
-    """Of each term, for force [N] and torque [N m]."""
-    vehicle: VehicleParams
-    """The base model refitted beside it, with the effect."""
-    gain: float
-    """Share of the excess residual that it predicts on held-back manoeuvres (of the training trials)."""
-    by_manoeuvre: dict[str, float]
-    """Lowering of the squared white residual of each manoeuvre, held back."""
-    cost: tuple[float, float]
-    """Squared white residual of the training trials per sample, replayed before and after."""
-    tried: tuple[tuple[str, str, float], ...]
-    """Quantity, kind and held-back gain of every table that was fitted."""
+    terms: tuple[Term, ...]  # the sum that stands for the tables; none where no compact one does
+    coefficients: tuple[np.ndarray, ...]  # of each term, for force [N] and torque [N m]
+    vehicle: VehicleParams  # the base model refitted beside it, with the effect
+    gain: float  # share of the excess residual that it predicts on held-back manoeuvres (of the training trials)
+    by_manoeuvre: dict[str, float]  # lowering of the squared white residual of each manoeuvre, held back
+    cost: tuple[float, float]  # squared white residual of the training trials per sample, replayed before and after
+    tried: tuple[tuple[str, str, float], ...]  # quantity, kind and held-back gain of every table that was fitted
     angles: np.ndarray  # (B,) rad, of the wheels at the start of each trial
     kept: bool
 
@@ -337,8 +328,7 @@ def vehicle_of(result: Result, parameters: dict[str, float]) -> VehicleParams:
 
 
 def replay_unnamed(result: Result, found: Unnamed, trials: tuple[Trial, ...]) -> list[Prediction]:
-    """Replays of trials with the wrench. A wheel's start angle is that which fits each trial's reported speeds best,
-    held-out ones too: nothing else shows it."""
+    """Replays of trials with the wrench; a wheel's start angle is that which fits each trial's reported speeds best."""
     batch, measured = make_batch(trials, result.plant.dt, RECORD_DT)
     replay = Replay(result.plant, batch, lambda values: set_values(found.vehicle, ["unnamed.start_angle"], values))
     seen = replay.simulate((PHASES if found.table.quantity in WHEELS else PHASES[:1])[:, None])

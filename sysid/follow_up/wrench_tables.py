@@ -1,8 +1,7 @@
 """Regression of a residual on tables over one quantity, and on sums of few terms that may stand for them.
 
-A table has a force and a torque at each knot. What each knot changes in the white features is a column; all products
-are multiplied out by manoeuvre, so that fitting to some manoeuvres and asking the others is algebra. A table over a
-wheel's angle starts at its own angle in every drive.
+All products of columns (one a knot) are multiplied out by manoeuvre, so that fitting to some and asking the others is
+algebra.
 """
 
 from __future__ import annotations
@@ -12,9 +11,115 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.follow_up.wrench_terms import HARMONICS, Term, columns_of, forward_selection, library
 from sysid.missing.unexplained import PHASES, WHEELS, align, wave_turns
 from whill_mjx.effects.unnamed import ACROSS, KNOTS, MAP, PERIODIC, QUANTITIES
+
+HARMONICS = 3
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term: its columns go into a sum together or not at all."""
+
+    form: str  # power, harmonic, sign, decay or log
+    number: float  # exponent, harmonic, or the size over which it acts
+
+    def of(self, z: np.ndarray) -> np.ndarray:
+        """Values (K, c) at z (K,)."""
+        match self.form:
+            case "harmonic":
+                return np.stack([np.sin(self.number * z), np.cos(self.number * z)], axis=-1)
+            case "sign":
+                return np.tanh(z / self.number)[:, None]
+            case "decay":
+                return np.exp(-z / self.number)[:, None]
+            case "log":
+                return np.log1p(np.maximum(z, 0.0) / self.number)[:, None]
+            case "size":
+                return np.abs(z)[:, None]
+        return z[:, None] ** self.number
+
+    def text(self, coefficients: np.ndarray) -> str:
+        """The term with its coefficients (c,), with a sign in front."""
+        value = float(coefficients[0])
+        match self.form:
+            case "harmonic":
+                size, phase = float(np.hypot(*coefficients)), float(np.arctan2(coefficients[1], coefficients[0]))
+                angle = "z" if self.number == 1 else f"{self.number:g} z"
+                start = f" {'+' if phase >= 0 else '-'} {abs(phase):.2f}" if abs(phase) >= 0.005 else ""
+                return f"+ {size:.3g} sin({angle}{start})"
+            case "sign":
+                body = f" tanh(z / {self.number:.3g})"
+            case "decay":
+                body = f" exp(-z / {self.number:.3g})"
+            case "log":
+                body = f" ln(1 + z / {self.number:.3g})"
+            case "size":
+                body = " |z|"
+            case _:
+                body = {0.0: "", 1.0: " z"}.get(self.number, f" z^{self.number:g}")
+        return f"{'+' if value >= 0 else '-'} {abs(value):.3g}{body}"
+
+
+def library(knots: np.ndarray, periodic: bool) -> tuple[Term, ...]:
+    """Terms that make sense over a range of a quantity."""
+    constant = Term("power", 0.0)
+    if periodic:
+        return (constant, *(Term("harmonic", float(k)) for k in range(1, HARMONICS + 1)))
+    low, high = float(knots[0]), float(knots[-1])
+    powers = [Term("power", float(k)) for k in (1, 2, 3)]
+    if low < 0:
+        return (constant, *powers, Term("size", 1.0), *(Term("sign", share * (high - low)) for share in (0.02, 0.1)))
+    sizes = [share * high for share in (0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.57)]
+    return (constant, *powers, *(Term("decay", size) for size in sizes), *(Term("log", size) for size in sizes[:4:2]))
+
+
+def columns_of(terms: Sequence[Term], knots: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
+    """Basis (2 K, T) of the tables - forces, then torques - and the columns of each term: its force's, its torque's."""
+    parts, groups, start = [], [], 0
+    for term in terms:
+        values = term.of(knots)
+        width = values.shape[1]
+        parts.append(np.block([[values, np.zeros_like(values)], [np.zeros_like(values), values]]))
+        groups.append(list(range(start, start + 2 * width)))
+        start += 2 * width
+    return np.concatenate(parts, axis=1), groups
+
+
+def forward_selection(
+    matrix: np.ndarray, moments: np.ndarray, size: int, groups: Sequence[Sequence[int]], most: int
+) -> list[list[int]]:
+    """Terms of the best sum of 1, 2, ... `most` terms: each joins the one before that lowers the squares most.
+
+    Args:
+        matrix, moments: products (P + T, P + T) and (P + T,) with the base's P = size columns in front, prior included.
+        groups: columns of each term, counted after those of the base.
+    """
+    chosen: list[int] = []
+    path = []
+    while len(chosen) < min(most, len(groups)):
+        gains = [-np.inf if k in chosen else explained(matrix, moments, size, groups, [*chosen, k])
+                 for k in range(len(groups))]
+        chosen = [*chosen, int(np.argmax(gains))]
+        path.append(list(chosen))
+    return path
+
+
+def explained(matrix: np.ndarray, moments: np.ndarray, size: int, groups: Sequence[Sequence[int]],
+              chosen: Sequence[int]) -> float:
+    """Explained sum of squares with these terms beside the base."""
+    order = [*range(size), *(size + i for k in chosen for i in groups[k])]
+    inside = matrix[np.ix_(order, order)].copy()
+    inside[np.diag_indices(len(order))] *= 1 + 1e-6
+    inside[np.diag_indices(len(order))] += 1e-9
+    return float(moments[order] @ np.linalg.solve(inside, moments[order]))
+
+
+def in_words(terms: Sequence[Term], coefficients: Sequence[np.ndarray], half: int) -> str:
+    """The sum of the forces (half 0) or torques (half 1), of coefficients (2 c,) of each term."""
+    texts = [term.text(np.split(np.asarray(values), 2)[half]) for term, values in zip(terms, coefficients, strict=True)]
+    return " ".join(texts).removeprefix("+ ")
+
 
 SMOOTHING = (0.01, 0.1, 1.0, 10.0)
 """Weights of the tables' second differences that are tried, as shares of the drives' information on a knot."""
@@ -54,8 +159,7 @@ class WrenchTable:
 
     @property
     def roughness(self) -> np.ndarray:
-        """(KNOTS, KNOTS) of a table: sum of squares of its second differences, of a map's along both ways, and a bit
-        of its own."""
+        """(KNOTS, KNOTS) of a table: squares of second differences (a map's both ways), and a bit of its own."""
         if self.quantity == MAP:
             bend = np.concatenate([np.kron(np.eye(ROWS), _bends(ACROSS)), np.kron(_bends(ROWS), np.eye(ACROSS))])
         else:
@@ -63,8 +167,7 @@ class WrenchTable:
         return np.asarray(bend.T @ bend + SHRINK * np.eye(KNOTS))
 
     def parameters(self, wrench: np.ndarray, start: float = 0.0) -> dict[str, float]:
-        """Parameters of the effect for a table (2 KNOTS,) of forces [N], then torques [N m], and a wheel's start
-        angle [rad]."""
+        """Parameters of the effect for a table (2 KNOTS,) of forces [N] and torques [N m], and a start angle [rad]."""
         number = list(QUANTITIES).index(self.quantity) + 1
         found = {"quantity": float(number), "low": self.low, "high": self.high, "low_y": self.low_y,
                  "high_y": self.high_y, "with_motion": float(self.kind == "brake"), "start_angle": start}
@@ -105,11 +208,7 @@ class Products:
 def multiplied(
     residual: np.ndarray, jacobian: np.ndarray, columns: np.ndarray, groups: Sequence[Sequence[int]]
 ) -> Products:
-    """Products by groups of trials.
-
-    Args:
-        residual: (B, n); jacobian: (B, n, P) of the base; columns: (B, n, S) of the tables.
-    """
+    """Products by groups of trials: residual (B, n), Jacobian (B, n, P) of the base, columns (B, n, S) of tables."""
     design = np.concatenate([jacobian, columns], axis=-1)
     flat = [design[list(group)].reshape(-1, design.shape[-1]) for group in groups]
     rest = [residual[list(group)].reshape(-1) for group in groups]
@@ -154,8 +253,7 @@ def gains_without(products: Products, penalty: np.ndarray, size: int) -> np.ndar
 
 
 def few_terms(products: Products, precision: np.ndarray, table: WrenchTable) -> tuple[np.ndarray, tuple[Term, ...]]:
-    """The best sum of few terms and its gain (G,) on each group, chosen and fitted on the other groups; none for a map.
-    """
+    """The best sum of few terms and its gain (G,) on each group, chosen and fitted on the others; none for a map."""
     if table.quantity == MAP:
         return np.full(len(products.square), -np.inf), ()
     terms = library(table.knots, table.quantity in PERIODIC)
@@ -206,8 +304,7 @@ def turned(table: WrenchTable, columns: np.ndarray, residual: np.ndarray) -> tup
 def from_first_wave(
     terms: Sequence[Term], coefficients: Sequence[np.ndarray]
 ) -> tuple[tuple[np.ndarray, ...], float]:
-    """The same waves counted from where the first of the force rises through zero, as anybody may choose for a wheel;
-    and by how much more every drive then starts [rad]."""
+    """The same waves counted from where the first of the force rises through zero, and the angle [rad] to there."""
     first = next((values for term, values in zip(terms, coefficients, strict=True)
                   if term.form == "harmonic" and term.number == 1), None)
     if first is None:

@@ -18,8 +18,7 @@ from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 
-INFLATION = 13.7
-"""Samples that count as one: an AR(1) residual of 0.9 at 20 Hz makes z-values 3.7 times too large."""
+INFLATION = 13.7  # samples that count as one: an AR(1) residual of 0.9 at 20 Hz makes z-values 3.7 times too large
 QUANTILE = 1.645  # of a 90 % interval
 DEFAULT = Noise(DEFAULT_NOISE["ground_truth"] / 4, DEFAULT_NOISE["odometry"] / 4, "defaults")
 Criterion = Literal["a", "d"]
@@ -32,10 +31,8 @@ class Plan:
     candidate: Candidate
     deviation: np.ndarray
     """(P,) standard deviations after the drive, in unit coordinates; those of the bounds where nothing is known."""
-    trace: float
-    """Sum of variances over the identifiable subspace, relative to that before the drive."""
-    volume: float
-    """Logarithm of the ratio of volumes after and before: -0.69 per halved standard deviation."""
+    trace: float  # sum of variances over the identifiable subspace, relative to that before the drive
+    volume: float  # logarithm of the ratio of volumes after and before: -0.69 per halved standard deviation
     information: np.ndarray  # (P, P) in unit coordinates
     path: np.ndarray  # (T, 2) m, simulated, from the start pose
     start: tuple[float, float, float]
@@ -65,8 +62,7 @@ def candidate_objective(
 ) -> Objective:
     """Objective over candidates yet to be driven, whose "measurements" are the replay at the space's initial values.
 
-    Args:
-        apply: values (P,) -> the plant's parameters.
+    `apply`: values (P,) -> the plant's parameters.
     """
     sigma = float(noise.pose[0]), float(noise.pose[2])
     trials = tuple(as_trial(candidate, channels=channels, sigma=sigma) for candidate in candidates)
@@ -79,11 +75,7 @@ def candidate_objective(
 
 
 def information(objective: Objective, values: np.ndarray) -> np.ndarray:
-    """(B, P, P) information of each candidate in unit coordinates, with INFLATION taken off.
-
-    Args:
-        values: (P,) those of `candidate_objective`, which its slopes in unit coordinates belong to.
-    """
+    """(B, P, P) information of each candidate in unit coordinates at values (P,), with INFLATION taken off."""
     _, jacobian = objective.jacobian(objective.space.to_unit(values)[None])
     found: np.ndarray = np.einsum("bkp,bkq->bpq", jacobian[0], jacobian[0]) / INFLATION
     return found
@@ -111,12 +103,7 @@ def rank(
     candidates: Sequence[Candidate], found: np.ndarray, prior: np.ndarray, paths: Sequence[np.ndarray],
     starts: Sequence[tuple[float, float, float]], criterion: Criterion = "a",
 ) -> list[Plan]:
-    """Candidates by their information, best first.
-
-    Args:
-        found: (B, P, P) information of each.
-        prior: (P, P) what is known before.
-    """
+    """Candidates by their information `found` (B, P, P), beside what is known before (`prior`, (P, P)), best first."""
     subspace = identifiable_subspace(prior + found.sum(axis=0))
     if not subspace.shape[1]:
         subspace = np.eye(len(prior))
@@ -141,8 +128,7 @@ class Subject:
 
     spec: VehicleSpec
     params: Any
-    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """90 % intervals by parameter name."""
+    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)  # 90 % intervals by parameter name
     noise: Noise = DEFAULT
 
 
@@ -151,23 +137,18 @@ class Proposal:
     """Manoeuvres to drive next, and why."""
 
     chosen: list[Plan]
-    plans: list[Plan]
-    """All plans for the first choice, best first."""
+    plans: list[Plan]  # all plans for the first choice, best first
     space: Space
-    before: np.ndarray
-    """(P,) deviations before the drives, in unit coordinates."""
+    before: np.ndarray  # (P,) deviations before the drives, in unit coordinates
 
 
 def propose(
     subject: Subject, limits: Limits | None = None, *, channels: str = "both", criterion: Criterion = "a",
     count: int = 1, names: Sequence[str] | None = None,
 ) -> Proposal:
-    """The next manoeuvres of a vehicle.
+    """The next `count` manoeuvres of a vehicle, chosen one after the other.
 
-    Args:
-        channels: what will be measured.
-        count: how many manoeuvres, chosen one after the other.
-        names: parameters of interest; by default all that a log can determine.
+    `channels`: what will be measured; `names`: parameters of interest, by default all that a log can determine.
     """
     spec, params = subject.spec, subject.params
     limits = limits or Limits(max(spec.v_min, -1.0), min(spec.v_max, 1.0), min(spec.omega_max, 1.0))

@@ -1,19 +1,19 @@
 """Which errors of a log are independent of one another: those of samples, of pieces, of drives, or of places.
 
-Residuals of a driving log are mostly autocorrelated, so that the usual (J^T J)^-1 understates the errors several times.
-Trials are independent drives: the variance is that of their sums (`sysid.intervals.sandwich`), whatever the
-correlation within a
-drive. Where too few trials inform a parameter, or where they happen to differ less than pieces of them do, blocks are
-pieces of trials, and errors are no less than those of independent samples. What replicates share is no noise but what
-the model gets wrong about a manoeuvre; where they share more than chance would have it, manoeuvres are the independent
-blocks. Errors may also be shared at a place of their drives alone: where wheels break away, the mean of many drives is
-not the drive without disturbances. The pieces of a manoeuvre, all its replicates together, are blocks of a further
-kind, and no error is less than either kind has it.
+Residuals of a drive are autocorrelated: the usual (J^T J)^-1 understates errors several times. Trials are independent:
+the variance is that of their sums. Where too few trials inform a parameter, or differ less than their pieces do, blocks
+are pieces, and errors no less than those of independent samples. What replicates share is
+no noise but what the model gets wrong about a manoeuvre: where they share more than by chance, manoeuvres are the
+blocks. Errors may be shared at a place of drives alone, where wheels break away: pieces of a manoeuvre, replicates
+together, are blocks of a further kind.
 
-The widest of several estimates is too wide: by chance one of them exceeds what is true, and intervals of 90 % hold in
-95. How much narrower they may be is found by doing the same again with the errors that were found, the signs of whole
-blocks at random (the wild bootstrap of a studentised estimate). That is done with every kind of blocks, and what needs
-the widest intervals counts. Source: Cameron, Gelbach and Miller (2008).
+The widest of several estimates exceeds the truth by chance: 90 % intervals hold in 95. How much narrower they may be is
+found by a wild bootstrap (signs of whole blocks at random), for every kind of blocks; what needs the widest intervals
+counts. Source: Cameron, Gelbach and Miller (2008).
+
+Variances: gradients are added within a block before they are squared, and each block's residual is divided by the root
+of what the fit leaves of independent errors, I - H_gg (CR2, unbiased for those). Few blocks know their own variance
+badly: its degrees of freedom are Satterthwaite's. Source: Bell and McCaffrey (2002); Pustejovsky and Tipton (2018).
 """
 
 from __future__ import annotations
@@ -23,13 +23,51 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sysid.intervals.sandwich import Sandwich, sandwich
+LEAST_LEFT = 1e-3  # of a direction of which a block keeps less than this share of its errors, its residual says nothing
+
+
+@dataclass(frozen=True)
+class Sandwich:
+    """How G independent blocks move P estimates."""
+
+    moves: np.ndarray  # (G, P, P): of each block's J^T r, corrected for what the estimates follow
+    freedom: np.ndarray  # (P,) degrees of freedom of the variances
+    informed: np.ndarray  # (P,) expected variance for independent errors, over what it is then
+
+    def covariance(self, scores: np.ndarray) -> np.ndarray:
+        """(P, P) of the estimates, from J_g^T r_g (G, P) of each block at the minimum."""
+        moved = np.einsum("gpq,gq->gp", self.moves, scores)
+        return moved.T @ moved
+
+    def variances(self, scores: np.ndarray) -> np.ndarray:
+        """(N, P) diagonals of covariances, from scores (N, G, P)."""
+        return np.square(np.einsum("gpq,ngq->ngp", self.moves, scores, optimize=True)).sum(1)
+
+
+def sandwich(blocks: np.ndarray, inverse: np.ndarray) -> Sandwich:
+    """The variances of a minimum of squares, from J_g^T J_g (G, P, P) of blocks and the inverse (P, P) of their sum."""
+    value, vector = np.linalg.eigh(inverse)
+    half = (vector * np.sqrt(np.maximum(value, 0.0))) @ vector.T
+    share, axes = np.linalg.eigh(half @ blocks @ half)  # (G, P), (G, P, P): of the errors that the estimates follow
+    left = 1.0 - np.clip(share, 0.0, 1.0)
+    gain = np.where(left > LEAST_LEFT, np.maximum(left, LEAST_LEFT) ** -0.5, 0.0)
+    local = axes.swapaxes(1, 2) @ half  # (G, P, P)
+    # Of independent errors of variance 1, blocks g and h move p with the covariance lengths_gp (g = h) - z_gp^T z_hp.
+    lengths = np.einsum("gkp,gk->gp", local**2, share * gain**2)
+    z = axes @ ((share * gain)[..., None] * local)  # (G, P, P)
+    freedom, expected = np.empty(len(inverse)), np.empty(len(inverse))
+    for p in range(len(inverse)):
+        products = np.diag(lengths[:, p]) - z[:, :, p] @ z[:, :, p].T
+        expected[p] = np.trace(products)
+        freedom[p] = expected[p] ** 2 / max(float(np.square(products).sum()), 1e-300)
+    return Sandwich(local.swapaxes(1, 2) @ (gain[..., None] * local), freedom,
+                    expected / np.maximum(np.diag(inverse), 1e-300))
+
 
 CONFIDENCE = 0.90
 ENOUGH = 2.0
 """Degrees of freedom from which the variance between blocks is taken: three or four drives that inform of one."""
-CHANCE = 0.05
-"""Probability below which what replicates share is taken for the model's error."""
+CHANCE = 0.05  # probability below which what replicates share is taken for the model's error
 FLIPS, AT_ONCE = 999, 2**22  # draws of the signs of blocks; numbers that are drawn together
 
 
@@ -41,13 +79,10 @@ class Information:
     scores: np.ndarray  # (B, K, P) J^T r of pieces of trials
     blocks: np.ndarray  # (B, K, P, P) J^T J of them
     groups: np.ndarray  # (B,) number of the manoeuvre that each trial is a replicate of
-    alike: float
-    """How probable residuals of replicates that are so much alike are, were they independent."""
-    variance: float
-    """Of residuals."""
+    alike: float  # how probable residuals of replicates that are so much alike are, were they independent
+    variance: float  # of residuals
     precision: np.ndarray  # (P, P) of what is known besides
-    share: float
-    """Variance that the precision is stated for."""
+    share: float  # variance that the precision is stated for
     ahead: np.ndarray = field(default_factory=lambda: np.ones((2, 1)))
     """(2, P) how many times as wide the intervals would be from their lower and upper ends."""
 
@@ -116,14 +151,11 @@ def errors_of(evidence: Information, confidence: float = CONFIDENCE) -> Standard
 
 
 def shared_error(series: np.ndarray, groups: np.ndarray) -> float:
-    """How probable it is that the residuals of independent trials of one group are so much alike.
+    """Probability that residuals (B, K) of independent trials of one group (B,) are so much alike; 1 without such a
+    group.
 
-    Independent trials might as well have had the opposite errors, whatever the correlation within each: their products
-    with one another are compared with those for random signs of the trials. 1 without a group of several trials.
-
-    Args:
-        series: (B, K) residuals, each trial's in its own frame.
-        groups: (B,) number of the group that each is of.
+    Independent trials might as well have had the opposite errors: their products with one another are compared with
+    those for random signs of the trials. Each trial's residuals are in its own frame.
     """
     alike = (groups[:, None] == groups) & ~np.eye(len(groups), dtype=bool)
     if not alike.any():
@@ -155,12 +187,8 @@ def _kinds(evidence: Information, inverse: np.ndarray) -> dict[str, Kind]:
 def _widest(
     kinds: Mapping[str, Kind], scores: np.ndarray, independent: np.ndarray, confidence: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors (N, P) and quantiles (N, P) of scores (N, B, K, P): between drives where they know it, or else
-    within them; no interval is narrower than by any other kind.
-
-    Args:
-        independent: (P,) standard errors if all samples were independent.
-    """
+    """Standard errors (N, P) and quantiles (N, P) of scores (N, B, K, P): between drives where they know it, else
+    within; none is less than by any other kind, or than `independent` (P,) of independent samples."""
     from scipy import stats
 
     deviation = {name: np.sqrt(kind.sandwich.variances(kind.sums(scores))) for name, kind in kinds.items()}
@@ -179,8 +207,8 @@ def _widest(
 def _flipped(
     evidence: Information, kind: Kind, inverse: np.ndarray, random: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """How far estimates are off (N, P), and scores (N, B, K, P) there, with the signs of blocks at random; some of
-    `FLIPS` at a time. Errors are residuals as the sandwich corrects them."""
+    """How far estimates are off (N, P), and scores (N, B, K, P) there, with random signs of blocks, `FLIPS` at a time.
+    """
     moves = kind.sandwich.moves[kind.label]  # (B, K, P, P)
     errors = np.einsum("pr,bkrq,bkq->bkp", np.linalg.inv(inverse), moves, evidence.scores, optimize=True)
     count = max(AT_ONCE // errors.size, 1)

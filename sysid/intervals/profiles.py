@@ -1,10 +1,8 @@
 """Profile likelihoods: how well a log knows one parameter when all others make the best of each of its values.
 
-An interval from curvature at the fitted point is a parabola's; a profile follows walls, valleys and saturation, may be
-one-sided, and shows where a parameter is free of the data. Squares of autocorrelated residuals count more often than
-they inform, so that their increase is divided by as much as the sandwich variance of the parameter exceeds that of
-independent residuals: near its minimum the profile then agrees with the intervals of `sysid.intervals.uncertainty`.
-Source of the scaling: Rotnitzky and Jewell (1990).
+A profile follows walls, valleys and saturation, may be one-sided, and shows where a parameter is free of the data. Its
+increase is divided by what the sandwich variance exceeds that of independent residuals by: near its minimum it agrees
+with `sysid.intervals.uncertainty`. Source of the scaling: Rotnitzky and Jewell (1990).
 """
 
 from __future__ import annotations
@@ -15,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.errors.pose_objective import DriveResiduals
-from sysid.errors.robust import robust_cost
-from sysid.errors.space import Space
+from sysid.errors.space import Space, robust_cost
 from sysid.intervals.uncertainty import Uncertainty
 from sysid.search import least_squares
 from sysid.search.result import Progress
@@ -24,8 +21,7 @@ from sysid.search.result import Progress
 POINTS = 9
 ITERATIONS = 4
 BETTER = 0.02  # of the threshold by which another point must be better to be reported
-REACH = 2.0
-"""How far the grid reaches, in half-widths of the interval from curvature."""
+REACH = 2.0  # how far the grid reaches, in half-widths of the interval from curvature
 
 
 @dataclass(frozen=True)
@@ -36,13 +32,11 @@ class Profile:
     values: np.ndarray  # (G,) ascending
     cost: np.ndarray  # (G,) mean squared residual, the other parameters at their best
     statistic: np.ndarray  # (G,) 0 at the best; twice the loss of log likelihood
-    threshold: float
-    """Of the statistic at the confidence level."""
+    threshold: float  # of the statistic at the confidence level
     interval: tuple[float | None, float | None]
     """Where the statistic crosses the threshold; None where it does not within the grid."""
     others: np.ndarray  # (G, P) values of all parameters
-    fitted: float
-    """Value where the fit had ended."""
+    fitted: float  # value where the fit had ended
 
     def remark(self, space: Space) -> str:
         """Which ends of the interval are open, and whether the profile found a better point than the fit."""
@@ -67,23 +61,15 @@ class Minimum:
     u: np.ndarray  # (P,) unit coordinates
     known: Uncertainty
     """Intervals there, which set a grid's reach; a parameter that is not determined gets its whole range."""
-    robust: bool = False
-    """It is the minimum of the Huber loss."""
+    robust: bool = False  # it is the minimum of the Huber loss
 
 
 def profile(
     objective: DriveResiduals, at: Minimum, names: Sequence[str], *, points: int = POINTS, iterations: int = ITERATIONS,
     progress: Progress | None = None,
 ) -> list[Profile]:
-    """Profile likelihoods at the fitted point, all points of a grid searched together.
-
-    Args:
-        names: which parameters.
-        points: of the grid, besides the fitted one.
-
-    Raises:
-        ValueError: a name is not searched.
-    """
+    """Profile likelihoods of `names` at the fitted point, all `points` of a grid searched together; ValueError where a
+    name is not searched."""
     space, u, known, robust = objective.space, at.u, at.known, at.robust
     check_names(space, names)
     sd = np.maximum(known.deviation, 1e-8)

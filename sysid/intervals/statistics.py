@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-EXACT_UP_TO = 12
-"""Pairs up to which all sign patterns are counted (4096 of them)."""
+EXACT_UP_TO = 12  # pairs up to which all sign patterns are counted (4096 of them)
 RESAMPLES = 20_000
 TIE = 1e-12  # relative difference of two sums that counts as none
 
@@ -15,11 +14,8 @@ TIE = 1e-12  # relative difference of two sums that counts as none
 def sign_flip_p(differences: Sequence[float] | np.ndarray, seed: int = 0) -> float:
     """Two-sided p-value of paired differences (n,) against a mean of 0, by flipping their signs.
 
-    Exact for up to EXACT_UP_TO pairs, else from RESAMPLES random patterns with the observed one counted in. With n
-    pairs no p-value is below 2 / 2**n: three drives cannot reach 0.05, six can.
-
-    Raises:
-        ValueError: without pairs, or with differences that are not finite.
+    Exact for up to EXACT_UP_TO pairs, else from RESAMPLES random patterns. With n pairs no p-value is below 2 / 2**n:
+    three drives cannot reach 0.05, six can. ValueError without pairs, or with differences that are not finite.
     """
     values = np.asarray(differences, float)
     if values.ndim != 1 or not len(values) or not np.isfinite(values).all():

@@ -1,15 +1,12 @@
 """Confidence intervals of fitted parameters, and which of them the log cannot determine.
 
-The information of a log at the fitted point is summed over pieces of its trials; which of them have errors of their own
-`sysid.intervals.independence` decides. Slopes are averaged over the errors (`sysid.search.slopes`): by differences
-over a fixed share of
-their ranges, delays seem half as well known as they are; friction, slip and torque limits up to one and a half times.
+Information is summed over pieces of trials; `sysid.intervals.independence` decides which have errors of their own.
+Slopes are averaged over the errors (`sysid.search.slopes`).
 
-A log's information on the height of the mass depends on that height. An estimate that came out where it is large
-would have a narrow interval, whatever the truth is. Such an interval reaches as far as the information between
-adds up to: its half-width h at the fit and h' at the end that this has are measured, and the end lies where
-the integral of dx / h(x) is 1, with h a straight line through both. Where h does not change this is the usual interval.
-It is what a variance-stabilising transformation of the parameter would give (Bartlett 1947).
+A log's information on the height of the mass depends on that height: an estimate that came out where it is large would
+have a narrow interval, whatever the truth is. Such an interval ends where the integral of dx / h(x) is 1, with h a
+straight line through its half-widths at the fit and at its end, as after a variance-stabilising transformation
+(Bartlett 1947).
 """
 
 from __future__ import annotations
@@ -20,25 +17,21 @@ import numpy as np
 
 from sysid.errors.pose_objective import DriveResiduals, without_prior
 from sysid.errors.prior import UNKNOWN, expected_sd
-from sysid.errors.robust import HUBER, huber_weight, robust_cost
-from sysid.errors.space import BENT, NUISANCE, TERMS, Space
+from sysid.errors.space import BENT, HUBER, NUISANCE, TERMS, Space, huber_weight, robust_cost
 from sysid.intervals.independence import CONFIDENCE, Information, errors_of, shared_error
 from sysid.logs.metrics import replicate_groups
 from sysid.search import least_squares
 from sysid.search.slopes import average_slopes, likely, likely_by
 
-PIECES = 8
-"""That each trial is cut into."""
+PIECES = 8  # that each trial is cut into
 PASSES = 2  # of averaging slopes: over errors by differences, and by averaged slopes
-PRIOR_SD = UNKNOWN
-"""Standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)."""
+PRIOR_SD = UNKNOWN  # standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)
 UNIDENTIFIABLE = 0.5
 """Share of the prior's standard deviation above which a parameter counts as not determined by the log."""
 WALL = 1e-3  # distance to a bound, in unit coordinates, that counts as being on it
 FOLLOW = 2  # iterations of all others at the end of an interval
 NEAR = 0.25  # share of a half-width below which a bound is too near to look how wide the interval is from there
-WIDEST = 3.0
-"""Times a half-width at the fit that it may have at the end: an interval then reaches 3.2 of them."""
+WIDEST = 3.0  # times a half-width at the fit that it may have at the end: an interval then reaches 3.2 of them
 
 
 @dataclass(frozen=True)
@@ -48,12 +41,10 @@ class Estimate:
     name: str
     initial: float
     value: float
-    low: float
-    """Lower end of the confidence interval; that of the bounds where the log does not determine it."""
+    low: float  # lower end of the confidence interval; that of the bounds where the log does not determine it
     high: float
     identifiable: bool
-    remark: str
-    """Why it is not identifiable, or on which bound it lies; empty otherwise."""
+    remark: str  # why it is not identifiable, or on which bound it lies; empty otherwise
 
 
 @dataclass(frozen=True)
@@ -87,8 +78,7 @@ def estimate(
 ) -> Uncertainty:
     """Intervals of the parameters at the fitted point u (P,).
 
-    Args:
-        robust: u minimises the Huber loss: residuals beyond its bend pull with a constant force and add no curvature.
+    `robust`: u minimises the Huber loss: residuals beyond its bend pull with a constant force and add no curvature.
     """
     return uncertainty_of(evidence_of(objective, u, robust), objective.space, confidence)
 
@@ -100,8 +90,7 @@ def evidence_of(objective: DriveResiduals, u: np.ndarray, robust: bool = False) 
 
 
 def _ahead(objective: DriveResiduals, found: Information, robust: bool) -> np.ndarray:
-    """(2, P) how many times the half-width of each parameter's interval is that which it has from its lower and upper
-    end, the others following there. 1 unless the parameter is one of `BENT`."""
+    """(2, P) how many times as wide intervals of `BENT` parameters are from their lower and upper ends; 1 of others."""
     space, u = objective.space, found.u
     errors, ahead = errors_of(found), np.ones((2, space.size))
     reach, inverse = errors.quantile * errors.deviation, found.inverse
@@ -125,16 +114,16 @@ def _ahead(objective: DriveResiduals, found: Information, robust: bool) -> np.nd
 
 
 def stretched(ahead: np.ndarray) -> np.ndarray:
-    """Half-widths that an interval reaches, of how many times as wide it is from its end on a straight line: the x at
-    which the integral of 1 / (1 + (ahead - 1) x) is 1."""
+    """Half-widths that an interval reaches which is so many times as wide from its end: x with the integral of 1 / (1 +
+    (ahead - 1) x) equal to 1."""
     rise = np.clip(ahead - 1.0, -1.0, WIDEST - 1.0)
     level = np.abs(rise) < 1e-6
     return np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
 
 
 def _evidence_at(objective: DriveResiduals, u: np.ndarray, robust: bool, over: np.ndarray | None = None) -> Information:
-    """Information of drives at any point u (P,), by slopes averaged over errors of a covariance `over` (P, P): those of
-    slopes at u unless it is given."""
+    """Information of drives at a point u (P,), by slopes averaged over errors of a covariance (P, P), or those there.
+    """
     space = objective.space
     if over is not None:
         residual, jacobian = average_slopes(objective, u, over)
@@ -208,8 +197,7 @@ def _pieces(
 ) -> tuple[np.ndarray, np.ndarray]:
     """J^T r (B, PIECES, P) and J^T J (B, PIECES, P, P) of pieces of trials, all channels of a piece together.
 
-    Args:
-        bent: (B, K, P) the Jacobian with which residuals beyond the bend of a robust loss add no curvature.
+    `bent`: (B, K, P) the Jacobian with which residuals beyond the bend of a robust loss add no curvature.
     """
     piece = objective.pieces(PIECES)
     piece = np.pad(piece, (0, residual.shape[1] - len(piece)))  # errors of the start belong to the first piece

@@ -1,7 +1,6 @@
 """Times of receipt against header stamps: clocks that were set in the middle of a bag, and receipt in bursts.
 
-A recorder's messages are read in the order of their times, so that a clock that was set back shows in no stream alone.
-Against the header stamps it does: the lateness of receipt changes at once, and stays so.
+Messages are read in the order of their times, so a clock that was set back shows only against the header stamps.
 """
 
 from __future__ import annotations
@@ -23,19 +22,16 @@ REGULAR = 0.3  # share of the period that most of the header's stamps vary by at
 class Step:
     """A clock that was set while a bag was recorded."""
 
-    clock: str
-    """"receive" or "header"."""
-    seconds: float
-    """By how much it was set forward; negative where it was set back [s]."""
-    after: float
-    """Since the first header stamp [s]."""
+    clock: str  # "receive" or "header"
+    seconds: float  # by how much it was set forward; negative where it was set back [s]
+    after: float  # since the first header stamp [s]
 
 
 def find_step(received: np.ndarray, stamped: np.ndarray) -> Step | None:
     """The largest step of one clock against the other, from times (T,) [s] of each message; None where there is none.
 
-    In the order of a clock that was set back, messages of two moments are mixed, and no clear step is seen. It is seen
-    in both orders where a clock was set forward.
+    A clock that was set back mixes messages of two moments in its own order; one that was set forward shows in both
+    orders.
     """
     by_stamp, at = _largest_change(received, stamped, np.argsort(stamped, kind="stable"))
     by_receipt, also_at = _largest_change(received, stamped, np.argsort(received, kind="stable"))

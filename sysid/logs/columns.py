@@ -60,12 +60,9 @@ QUANTITY_WORDS = {
 }
 TICKS = re.compile(r"tick|count|enc(oder)?s?([ _]|$)", re.IGNORECASE)
 """In the names of wheel angles that an encoder counts."""
-PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")
-"""A unit of ticks: so many in a turn."""
-COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)
-"""In the names of columns that count rows."""
-PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")
-"""A unit of rows: so many in a second."""
+PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")  # A unit of ticks: so many in a turn
+COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)  # in the names of columns that count rows
+PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")  # A unit of rows: so many in a second
 SIDES = {"left": {"left", "l", "lw", "wl", "vl", "lft", "fl", "rl", "bl", "lf", "lb", "links", "linkes"},
          "right": {"right", "r", "rw", "wr", "vr", "rgt", "fr", "rr", "br", "rf", "rb", "rechts", "rechtes"}}
 CORNERS = {"fl", "rl", "bl", "lf", "lb", "fr", "rr", "br", "rf", "rb"}
@@ -91,19 +88,14 @@ class Column:
     """What one column holds."""
 
     role: str
-    file: str
-    """Stem of the file."""
+    file: str  # stem of the file
     name: str
     unit: str
-    why: str
-    """How role and unit were found; empty where somebody said both."""
+    why: str  # how role and unit were found; empty where somebody said both
     sure: bool = True
-    assumed: bool = False
-    """Whether neither name nor numbers show the unit, so that it is the usual one."""
-    moves: bool = True
-    """Whether its numbers change by what a moving vehicle would have in this unit."""
-    sign: float = 1.0
-    """-1 where it counts the other way round."""
+    assumed: bool = False  # whether neither name nor numbers show the unit, so that it is the usual one
+    moves: bool = True  # whether its numbers change by what a moving vehicle would have in this unit
+    sign: float = 1.0  # -1 where it counts the other way round
 
     def __str__(self) -> str:
         return f"{self.role}={self.file}/{self.name}:{'-' if self.sign < 0 else ''}{self.unit}"
@@ -119,10 +111,8 @@ class Table:
 
     stem: str
     columns: dict[str, np.ndarray]  # name -> (T,)
-    odd: Mapping[str, str] = field(default_factory=dict)
-    """Name of a column -> note on its cells that are no numbers."""
-    texts: Mapping[str, str] = field(default_factory=dict)
-    """Name of a column without numbers -> its first cell."""
+    odd: Mapping[str, str] = field(default_factory=dict)  # name of a column -> note on its cells that are no numbers
+    texts: Mapping[str, str] = field(default_factory=dict)  # name of a column without numbers -> its first cell
 
 
 def kind_of(role: str) -> str:
@@ -147,8 +137,7 @@ def size_of(role: str, unit: str) -> float:
 def read_decision(text: str, tables: Sequence[Table]) -> Column:
     """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it; a minus before the unit, or in its place, turns the sign.
 
-    Raises:
-        ValueError: naming the text, the rule and the remedy.
+    ValueError where it is none.
     """
     role, equals, rest = text.partition("=")
     role, rest = role.strip(), rest.strip()
@@ -176,11 +165,9 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
 def guess(
     tables: Sequence[Table], said: Sequence[Column] = (), units: Mapping[tuple[str, str], str] | None = None
 ) -> list[Column]:
-    """What the columns of the files of one drive hold, as far as names and numbers show it.
+    """What the columns of the files of one drive hold, as far as names and numbers show it; what is `said` is kept.
 
-    Args:
-        said: what is known already; it is kept.
-        units: units that other drives of the source show, by role and name of the column.
+    `units`: units that other drives of the source show, by role and name of the column.
     """
     found = list(said)
     taken = {(one.file, one.name) for one in said}
@@ -207,8 +194,7 @@ def guess(
 
 
 def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:
-    """Unit of each column, by role and name, that most drives show. A drive shows none where nothing moves; one that
-    shows its unit for sure counts a little more."""
+    """Unit of each column, by role and name, that most moving drives show; sure ones count a little more."""
     votes: dict[tuple[str, str], Counter[str]] = {}
     for columns in drives:
         for one in columns:
@@ -218,8 +204,7 @@ def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str
 
 
 def _origin_counts(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
-    """Poses of which no name says whether they are odometry's are so where they begin at the origin, as odometry does;
-    elsewhere nobody can know."""
+    """Poses whose names do not say so are odometry's if they begin at the origin; elsewhere nobody can know."""
     roles = {one.role for one in found}
     words = set(STREAM_WORDS["odometry"])
     nameless = [one for one in found if one.role in ("odometry.x", "odometry.y", "odometry.yaw")

@@ -1,7 +1,7 @@
 """The time-out of a base: how long it drives on where no command comes, from pauses of the commands in a log.
 
-The vehicle responds late, to a command that lapses as to one that is sent. So the time from the last command to half of
-the speed, less that from a command out of rest to half of its speed, is the time-out.
+It is the time from the last command to half of the speed, less that from a command out of rest to half of its speed:
+the vehicle responds equally late to both.
 """
 
 from __future__ import annotations
@@ -26,31 +26,23 @@ CONFIDENCE = 0.95
 class Stop:
     """A pause of the commands in which the vehicle stops though the last one was to move."""
 
-    begin: float
-    """s, of the last command."""
-    pause: float
-    """s until the next."""
-    falls: float
-    """s from the last command to half of the speed."""
+    begin: float  # s, of the last command
+    pause: float  # s until the next
+    falls: float  # s from the last command to half of the speed
 
 
 @dataclass(frozen=True)
 class Timeout:
     """The time-out of a base."""
 
-    value: float
-    """s after the last command."""
+    value: float  # s after the last command
     low: float
-    high: float
-    """95 % interval [s]."""
+    high: float  # 95 % interval [s]
     stops: int
-    trials: int
-    """In which it shows."""
-    first: str
-    """Of them the first."""
+    trials: int  # in which it shows
+    first: str  # of them the first
     at: float
-    pause: float
-    """s, of its first stop."""
+    pause: float  # s, of its first stop
 
 
 def command_timeout(trials: Sequence[Trial]) -> Timeout | None:
@@ -75,8 +67,7 @@ def command_timeout(trials: Sequence[Trial]) -> Timeout | None:
 
 
 def with_own_timeout(log: Log) -> Log:
-    """The log with the stops that its base makes by itself, where its training trials show them and it states no
-    time-out; a note says how long it is."""
+    """The log with the stops that its base makes by itself, where training trials show them, and a note."""
     if "command_timeout" in log.fields or log.fields.get("input") == "wheels":
         return log
     found = command_timeout(log.training)

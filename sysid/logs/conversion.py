@@ -91,8 +91,7 @@ class ConvertConfig:
 
 
 OF_RECORDINGS = ("vehicle", "wheel_radius", "track", "mass", "command_topic", "odometry_topic", "truth_topic",
-                 "imu_topic", "input", "stamp", "split")
-"""Options that are for bags and tables."""
+                 "imu_topic", "input", "stamp", "split")  # options that are for bags and tables
 
 
 @dataclass(frozen=True)
@@ -115,14 +114,7 @@ class Source:
 
 
 def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
-    """Write the dataset and load it again.
-
-    Returns:
-        The dataset as the fit will see it, and notes on what was chosen and left out.
-
-    Raises:
-        ValueError, FileNotFoundError: naming the file, the topic, the rule and the remedy.
-    """
+    """Write the dataset and load it again: the log that a fit will see, and notes on what was chosen and left out."""
     if not config.source.is_dir() and not config.source.is_file():
         what = "a pipe or a device" if config.source.exists() else "does not exist"
         raise FileNotFoundError(f"{config.source}: {what}. Give a ROS bag, a CSV file, a folder of them, or a measured "
@@ -262,12 +254,7 @@ def _text_drives(
 def bag_drives(
     path: Path, config: ConvertConfig, spec: VehicleSpec, wheels: bool = False
 ) -> tuple[list[Drive], list[str]]:
-    """Trials of one bag, and notes.
-
-    Args:
-        spec: nominal geometry, of wheels whose angles or rates were recorded.
-        wheels: the input is measured wheel speeds.
-    """
+    """Trials of one bag, and notes; `spec` has the geometry of wheels whose angles or rates were recorded."""
     asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic,
              "imu": config.imu_topic}
     topics = {name: topic for name, topic in asked.items() if topic is not None}
@@ -341,9 +328,10 @@ def _recording_name(path: Path) -> str:
 def cut(
     name: str, tables: dict[str, np.ndarray], span: tuple[float, float], source: Source
 ) -> Drive:
-    """The part of a recording between two times [s] as a trial that counts from its start.
+    """The part of a recording between two times [s] as a trial that counts from its start, with the command then in
+    force.
 
-    The command in force at the start becomes its first row. Odometry is moved to start at the origin with heading 0.
+    Odometry is moved to start at the origin with heading 0.
     """
     begin, end = span
     found: dict[str, np.ndarray] = {}
@@ -441,18 +429,10 @@ def write_dataset(
     folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = (),
     more: Mapping[str, Any] | None = None, source: Path | None = None,
 ) -> list[str]:
-    """Write the trials that the loader accepts into a dataset folder; an existing dataset keeps its fields and trials.
+    """Write the trials that the loader accepts into a dataset folder, and note those left out; an existing dataset
+    keeps its fields and trials. `more`: further fields of a new dataset.toml; `source`: named in errors.
 
-    Args:
-        more: further fields of a new dataset.toml.
-        source: what they come from, for errors.
-
-    Returns:
-        Notes on the trials that were left out.
-
-    Raises:
-        ValueError: a trial exists already with other contents, two have one name, or none is accepted. Nothing was
-            written then.
+    ValueError, and nothing is written, where a trial exists with other contents, names repeat, or none is accepted.
     """
     names = [drive.name for drive in drives]
     twice = sorted({name for name in names if names.count(name) > 1})

@@ -9,13 +9,12 @@ import numpy as np
 
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.directions import UNLIKE
-from sysid.logs.lost_pose import LOST, lost
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
-from sysid.logs.standing import said, stood
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import pauses, set_forward, time_faults, uncommanded
+from sysid.logs.unusable import LOST, lost, said, stood
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
@@ -37,32 +36,20 @@ SPREAD_NAMES = {"ground_truth": ("x", "y", "yaw"), "odometry": ("x", "y", "yaw",
 class Excitation:
     """What one trial asks of the vehicle. Commands, except where measured is said."""
 
-    v: tuple[float, float]
-    """Least and greatest speed [m/s]."""
-    omega: tuple[float, float]
-    """Least and greatest yaw rate [rad/s]."""
-    reversals: int
-    """Changes of the driving direction."""
-    turn_changes: int
-    """Changes of the turning direction."""
+    v: tuple[float, float]  # least and greatest speed [m/s]
+    omega: tuple[float, float]  # least and greatest yaw rate [rad/s]
+    reversals: int  # changes of the driving direction
+    turn_changes: int  # changes of the turning direction
     slow_seconds: float
     """Time at speeds or yaw rates so low that a dead zone shows, without the other channel moving faster [s]."""
-    steps: int
-    """Changes of the command."""
-    step_sizes: int
-    """Distinct sizes of such changes, to 0.1 m/s and 0.1 rad/s."""
-    acceleration: float
-    """Greatest measured acceleration, over 0.2 s [m/s^2]."""
-    distance: float
-    """Path that the commands ask for [m]."""
-    turn: float
-    """Sum of turning, whatever direction [rad]."""
-    heading: float
-    """Start heading in the room [rad]; nan without outside pose."""
-    headings: float
-    """Share of the circle of headings that is visited, in 30 degree sectors; nan without outside pose."""
-    standstill: tuple[float, float]
-    """Seconds of standstill before and after the drive."""
+    steps: int  # changes of the command
+    step_sizes: int  # distinct sizes of such changes, to 0.1 m/s and 0.1 rad/s
+    acceleration: float  # greatest measured acceleration, over 0.2 s [m/s^2]
+    distance: float  # path that the commands ask for [m]
+    turn: float  # sum of turning, whatever direction [rad]
+    heading: float  # start heading in the room [rad]; nan without outside pose
+    headings: float  # share of the circle of headings that is visited, in 30 degree sectors; nan without outside pose
+    standstill: tuple[float, float]  # seconds of standstill before and after the drive
 
 
 def excitation(trial: Trial) -> Excitation:
@@ -122,8 +109,7 @@ def replicate_spread(trials: tuple[Trial, ...]) -> list[ReplicateGroup]:
 def sanity(log: Log, responses: Responses | None = None) -> list[str]:
     """Signs that a column has another unit, sign or origin than it should, as sentences.
 
-    Args:
-        responses: `response_shift` of every trial by channel, where it is known.
+    `responses`: `response_shift` of every trial by channel, where it is known.
     """
     standing = stood(log.trials, log.spec.track / 2)
     if standing:
@@ -238,8 +224,7 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
 
 
 def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
-    """A sentence where the measured speed follows the commanded yaw rate and the other way round, and not its own
-    command, which in a circle is much like the other; else empty."""
+    """A sentence where measured speed follows the commanded yaw rate, and the reverse, not its own; else ""."""
     other = [replace(one, command=Command(one.command.t, one.command.omega, one.command.v)) for one in trials]
     for index in (1, 2):
         as_it_is, follows = ([gain[1] for one in these if (gain := _gain(one, channel, index)) is not None]
@@ -253,8 +238,7 @@ def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
 
 
 def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:
-    """Size of a measured speed (1) or yaw rate (2) that larger commands do not raise, while it follows smaller ones;
-    None where nothing shows such a limit."""
+    """Size of a measured speed (1) or yaw rate (2) that larger commands, unlike smaller ones, do not raise, or None."""
     rows = []
     for trial in trials:
         rates = speeds(trial, channel)
@@ -294,8 +278,7 @@ class Blind:
     """One thing that the log does not determine."""
 
     cause: str
-    hidden: str
-    """What stays unknown for that reason."""
+    hidden: str  # what stays unknown for that reason
     remedy: str
 
 

@@ -1,7 +1,7 @@
 """Which way a pose travels in its own frame, beside the speeds that it should have.
 
-In the vehicle's own frame a pose moves forward by v, and to the left and ahead by what a turn adds at a point beside
-the axle. A regression of both on v and omega shows the angle between the pose's x axis and the way it travels.
+It moves forward by v, and to the left and ahead by what a turn adds at a point beside the axle: a regression on v and
+omega shows the angle between the pose's x axis and the way it travels.
 """
 
 from __future__ import annotations
@@ -41,15 +41,11 @@ class Motion:
 class Direction:
     """Which way a pose travels in its own frame."""
 
-    angle: float
-    """To the left of its own heading [rad]."""
+    angle: float  # to the left of its own heading [rad]
     error: float
-    explained: float
-    """Share of the motion that this explains."""
-    gain: float = 1.0
-    """Speed of the pose over the one it should have."""
-    gain_error: float = 0.0
-    """Infinite where the tracked point would be too far off."""
+    explained: float  # share of the motion that this explains
+    gain: float = 1.0  # speed of the pose over the one it should have
+    gain_error: float = 0.0  # infinite where the tracked point would be too far off
 
 
 def motion_of(trial: Trial, name: str) -> Motion | None:
@@ -80,12 +76,7 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
 
 
 def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
-    """Direction in which a pose travels.
-
-    Args:
-        reach: how far from the axle's centre its point may be [m].
-        mirrored: with y negated.
-    """
+    """Direction in which a pose travels, whose point is at most `reach` off the axle's centre [m]; `mirrored`: -y."""
     x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
     cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
     along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)

@@ -1,9 +1,8 @@
 """What a floor changes of a vehicle, measured on it without a model of it.
 
-A gyro beside the wheels' speeds shows what share of their difference turns the body, to 1 %. The command beside them
-shows how late they turn and drive, and how far they fall short of it. None of these needs an outside pose. Parameters
-of a physical model that say the same are many, and a log determines their sum only: a turn that falls short is scrub,
-slip or a wider track. Errors are those of blocks of drives that are left out in turn (block jackknife: Kuensch 1989).
+A gyro beside the wheels' speeds shows what share of their difference turns the body, to 1 %; the command beside them
+how late they turn and drive, and how far they fall short. No outside pose is needed. Physical parameters that say the
+same are many, and a log determines their sum only: scrub, slip or a wider track. Block jackknife: Kuensch (1989).
 """
 
 from __future__ import annotations
@@ -23,8 +22,7 @@ LAGS = np.geomspace(0.05, 5.0, 40)  # s that are tried
 BLOCKS = 8
 LEAST_TURNED = 0.5  # rad/s, root of the summed squares of a quantity's signal below which a block says nothing
 NAME = "floor"
-MEMBER = 2.0
-"""Standard errors beyond which a quantity is a member of the change."""
+MEMBER = 2.0  # standard errors beyond which a quantity is a member of the change
 CONFIDENCE = 1.96
 
 
@@ -34,12 +32,9 @@ class Quantity:
 
     name: str
     unit: str
-    parameter: str
-    """Of the vehicle's model that says most nearly the same."""
-    effects: tuple[str, ...]
-    """Effects that these drives cannot separate in it."""
-    lag: bool = False
-    """Whether it is a time, whose logarithm is estimated."""
+    parameter: str  # of the vehicle's model that says most nearly the same
+    effects: tuple[str, ...]  # effects that these drives cannot separate in it
+    lag: bool = False  # whether it is a time, whose logarithm is estimated
 
 
 QUANTITIES = (
@@ -155,22 +150,17 @@ class Member:
     quantity: Quantity
     before: float
     after: float
-    interval: tuple[float, float]
-    """95 % of its value on these drives."""
-    away: float
-    """Difference over its standard error; of a time, of its logarithm."""
+    interval: tuple[float, float]  # 95 % of its value on these drives
+    away: float  # difference over its standard error; of a time, of its logarithm
 
 
 @dataclass(frozen=True)
 class FloorChange:
     """Whether these drives were driven on another floor than the reference days."""
 
-    members: tuple[Member, ...]
-    """What differs, furthest first; where the change is real, at least one."""
-    p: float
-    """Of drives on the same floor, family-wise over all quantities."""
-    tried: int
-    """How many those are."""
+    members: tuple[Member, ...]  # what differs, furthest first; where the change is real, at least one
+    p: float  # of drives on the same floor, family-wise over all quantities
+    tried: int  # how many those are
     named: bool
 
     @property
@@ -196,8 +186,7 @@ class FloorChange:
 
 
 def compared(theirs: Measured, mine: Measured, freedom: float, alpha: float) -> FloorChange | None:
-    """Change from what was measured on one floor to what was measured elsewhere, by errors of so many degrees of
-    freedom; None where both show nothing."""
+    """Change between two floors, by errors of so many degrees of freedom; None where both show nothing."""
     error = np.hypot(mine.error, theirs.error)
     with np.errstate(invalid="ignore", divide="ignore"):
         away = np.where(error > 0, (mine.value - theirs.value) / error, np.nan)

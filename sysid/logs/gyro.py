@@ -1,8 +1,4 @@
-"""A yaw rate measured on the vehicle: its sign.
-
-Gyros are mounted upside down or logged with the sign of another convention. The yaw of an outside pose or of the
-odometry shows which way the vehicle really turned.
-"""
+"""A yaw rate measured on the vehicle: its sign, by the yaw of an outside pose or of the odometry."""
 
 from __future__ import annotations
 
@@ -13,19 +9,17 @@ import numpy as np
 
 from sysid.logs.records import Trial
 
-SURE = 0.9
-"""Least correlation of both turns, of either sign, that settles the sign."""
+SURE = 0.9  # least correlation of both turns, of either sign, that settles the sign
 LARGEST = 1.25
 """Factor by which a gyro may turn more or less than what is seen otherwise: as far as `gyro_bias.scale` goes."""
-LEAST_TURN = 0.5
-"""Root of the summed squares of the turns [rad] below which nothing turned."""
+LEAST_TURN = 0.5  # root of the summed squares of the turns [rad] below which nothing turned
 
 
-def told_sign(turns: Sequence[tuple[float, float]]) -> float | None:
-    """1.0 or -1.0, by which a gyro's rate is multiplied to agree with the yaw seen otherwise; None where nothing shows.
+def sign_shown(turns: Sequence[tuple[float, float]]) -> float | None:
+    """1.0 or -1.0, by which a gyro's rate is multiplied to agree with the yaw seen otherwise; None where nothing
+    shows.
 
-    Args:
-        turns: of pieces of the log, the turn [rad] that the gyro adds up to and the one seen by something else.
+    `turns`: of pieces of the log, the turn [rad] that the gyro adds up to and the one seen by something else.
     """
     if not len(turns):
         return None
@@ -39,13 +33,12 @@ def told_sign(turns: Sequence[tuple[float, float]]) -> float | None:
 def with_sign(trials: Sequence[Trial]) -> tuple[tuple[Trial, ...], list[str]]:
     """Trials with the gyro's turns counter-clockwise, and notes on what was changed.
 
-    A gyro whose turns do not follow those that the outside pose, or else the odometry, shows is left out: another axis,
-    or another unit. Errors of scale within its maker's reach are left to the fit.
+    A gyro whose turns do not follow the yaw that is seen otherwise is left out: another axis or unit.
     """
     turns = [each for trial in trials if (each := _turns(trial)) is not None]
     if not any(trial.gyro is not None for trial in trials):
         return tuple(trials), []
-    sign = told_sign(turns)
+    sign = sign_shown(turns)
     if sign is None:
         if float(np.linalg.norm([seen for _, seen in turns])) < LEAST_TURN:
             return tuple(trials), ["nothing turns enough to show the gyro's sign: it is taken as logged"]
@@ -64,11 +57,8 @@ def with_sign(trials: Sequence[Trial]) -> tuple[tuple[Trial, ...], list[str]]:
 
 
 def _turns(trial: Trial) -> tuple[float, float] | None:
-    """What the gyro turned, and what the outside pose, or else the odometry, shows [rad]; None without both.
-
-    Absolute turns would not show the sign, and whole drives may end as they began: the longest turn in either
-    direction counts, from its lowest to its highest heading.
-    """
+    """Longest turn of the gyro and of the outside pose, or else the odometry [rad], from lowest to highest heading;
+    None without both. Absolute turns would not show the sign, and whole drives may end as they began."""
     if trial.gyro is None:
         return None
     if trial.ground_truth is not None and len(trial.ground_truth.t) > 1:

@@ -41,8 +41,7 @@ FEATURES = {
     "action": ("command", ("v [m/s]", "omega [rad/s]")),
     "observation.state": ("odometry", ("x [m]", "y [m]", "yaw [rad]", "v [m/s]", "omega [rad/s]")),
     "observation.ground_truth": ("ground_truth", ("x [m]", "y [m]", "yaw [rad]")),
-}
-"""Feature -> stream and names of its parts, as they are written."""
+}  # feature -> stream and names of its parts, as they are written
 WIDEST = 10_000  # numbers of a feature in a row
 NEEDED = "{what} needs the package pyarrow, for its parquet files. Install it: pip install 'whill-mjx[lerobot]'."
 AGAIN = "Record or download the dataset again."
@@ -52,21 +51,14 @@ AGAIN = "Record or download the dataset again."
 class Episodes:
     """The drives of a LeRobotDataset."""
 
-    drives: list[tuple[str, Table]]
-    """Name and columns of each, named FEATURE/PART."""
-    held_out: tuple[str, ...]
-    """Episodes of another split than train."""
-    spec: VehicleSpec | None
-    """Nominal geometry, where `write` noted it."""
+    drives: list[tuple[str, Table]]  # name and columns of each, named FEATURE/PART
+    held_out: tuple[str, ...]  # episodes of another split than train
+    spec: VehicleSpec | None  # nominal geometry, where `write` noted it
     notes: tuple[str, ...]
 
 
 def read(path: Path) -> Episodes:
-    """The episodes of a LeRobotDataset, v3 or v2.
-
-    Raises:
-        ValueError: naming the file, the rule and the remedy; also where pyarrow is not installed.
-    """
+    """The episodes of a LeRobotDataset, v3 or v2; ValueError where it is none or pyarrow is not installed."""
     pq = _parquet(f"{path}: reading a LeRobotDataset")
     try:
         return _read(pq, path)
@@ -107,16 +99,10 @@ def _read(pq: Any, path: Path) -> Episodes:
 
 
 def write(folder: Path, log: Log, fps: int | None = None) -> list[str]:
-    """Write the trials of a log as a LeRobotDataset v3 into an empty folder.
+    """Write the trials of a log as a LeRobotDataset v3 into an empty folder, and return notes.
 
-    Args:
-        fps: frames per second; by default the rate of the measurements.
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: pyarrow is not installed, or trials differ in what was measured.
+    `fps`: frames per second; by default the rate of the measurements. ValueError where pyarrow is not installed, or
+    trials differ in what was measured.
     """
     pq = _parquet("writing a LeRobotDataset")
     trials = (*log.training, *log.held_out)  # so that each split is one range

@@ -34,8 +34,7 @@ from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
 
 SCHEMA = 1
-STANDSTILL = 1.0
-"""Longest part of a trial's start that is used to find its start pose [s]."""
+STANDSTILL = 1.0  # longest part of a trial's start that is used to find its start pose [s]
 START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command to move begins at rest
 
 SLOWEST = 4.0  # s between rows that no log has in all of its streams
@@ -50,11 +49,7 @@ GYRO_COLUMNS = ("t", "gyro")
 
 
 def load_log(folder: str | Path) -> Log:
-    """Load a driving-log dataset.
-
-    Raises:
-        FileNotFoundError, ValueError: naming the file, the value, the rule and the remedy.
-    """
+    """Load a driving-log dataset; FileNotFoundError or ValueError names the file, value, rule and remedy."""
     folder = Path(folder)
     if not folder.is_dir():
         what = "a file" if folder.exists() else "no such folder"
@@ -80,11 +75,7 @@ def load_log(folder: str | Path) -> Log:
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
-    """Load and check one trial folder.
-
-    Args:
-        timeout: after which the base stops where no command comes [s]; None where a command holds until the next.
-    """
+    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never)."""
     command_columns = read_csv(folder / "command.csv", COMMAND_COLUMNS)
     command = Command(**{name: command_columns[name] for name in COMMAND_COLUMNS})
     odometry = ground_truth = None
@@ -128,13 +119,11 @@ def make_trial(
     name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
     held_out: bool = False,
 ) -> Trial:
-    """A trial with its start: the pose is the mean over the standstill before the first command, at most one second;
-    the odometry is counted from there.
-
-    A trial whose first command already moves starts in motion, at the speeds that the odometry then reports, or at
-    those commanded where there is no odometry. Such a start is known from its first sample alone.
-    """
-    still = standstill_end(command)
+    """A trial with its start: the mean pose over at most one second of standstill before the first command; the
+    odometry is counted from there. A first command that already moves starts in motion, at the first sample and the
+    speeds of the odometry, or else those commanded."""
+    moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
+    still = float(min(command.t[moving[0]] if len(moving) else np.inf, command.t[0] + STANDSTILL))
     v, omega = _start_speeds(command, odometry)
     start = Start(v=v, omega=omega, rest=still)
     if ground_truth is not None:
@@ -152,13 +141,6 @@ def make_trial(
         cos, sin = np.cos(yaw0), np.sin(yaw0)
         odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
     return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
-
-
-def standstill_end(command: Command) -> float:
-    """Time of the first command to move, at most one second after the first command [s]."""
-    moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
-    first = command.t[moving[0]] if len(moving) else np.inf
-    return float(min(first, command.t[0] + STANDSTILL))
 
 
 def read_csv(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -200,14 +182,9 @@ def spec_from_fields(path: Path, fields: dict[str, Any]) -> tuple[VehicleSpec, l
 
 
 def of_file(log: Log, spec: VehicleSpec, place: str) -> Log:
-    """The log of the vehicle of a file: sizes and inertias that no dataset states, such as those of a fitted robot, are
-    the file's. Limits of commands stay the log's.
+    """The log of the vehicle of a file: sizes and inertias are the file's, limits of commands stay the log's.
 
-    Args:
-        place: the file.
-
-    Raises:
-        ValueError: wheels or drive differ.
+    ValueError where wheels or drive differ; `place` is the file, named in it.
     """
     check_same_vehicle(log, spec, place, "The vehicle file must be of the same vehicle",
                        ("wheel_radius", "track", "drive"))
@@ -221,13 +198,7 @@ def check_same_vehicle(
     log: Log, spec: VehicleSpec, place: str, rule: str,
     names: tuple[str, ...] = ("wheel_radius", "track", "wheelbase", "drive"),
 ) -> None:  # fmt: skip
-    """Raise ValueError where a vehicle of another geometry is given beside a log.
-
-    Args:
-        place: where it was given.
-        rule: the rule that is broken, in words.
-        names: fields of the spec that must agree.
-    """
+    """Raise ValueError where a vehicle given beside a log differs in a field of `names`, by `place` and `rule`."""
     for name in names:
         mine, theirs = getattr(log.spec, name), getattr(spec, name)
         if mine != theirs:
@@ -262,11 +233,7 @@ def read_fields(path: Path) -> dict[str, Any]:
 
 
 def _check_seconds(folder: Path, times: dict[str, np.ndarray]) -> None:
-    """Rows must not be as far apart as no recording's are: this finds milliseconds and smaller units.
-
-    Args:
-        times: of each file (T,).
-    """
+    """Refuse times (T,) of files that are as far apart as no recording's are: milliseconds or smaller units."""
     steps = {name: float(np.median(np.diff(t))) for name, t in times.items() if len(t) > 1}
     spans = {name: float(t[-1] - t[0]) for name, t in times.items() if len(t) > 1}
     for name, t in times.items():

@@ -1,9 +1,7 @@
 """Manoeuvres that an experiment can be chosen from, within limits of speed and room.
 
-All begin and end with a second of standstill. The paper's five and the others of `whill_mjx.logs.manoeuvres` are
-driven at
-two sizes; added are two-sided pseudo-random steps, chirps, ladders of step sizes, stop and go, slow yaw, and a square,
-which drives along four headings.
+All begin and end with a second of standstill. Those of `whill_mjx.logs.manoeuvres` are driven at two sizes; added are
+pseudo-random steps, chirps, ladders of step sizes, stop and go, slow yaw, and a square along four headings.
 """
 
 from __future__ import annotations
@@ -168,11 +166,9 @@ def make_command(name: str, v: float, omega: float, seconds: float, dt: float = 
 
 
 def as_trial(candidate: Candidate, channels: str = "both", sigma: tuple[float, float] = (0, 0)) -> Trial:
-    """A trial that is yet to be measured.
+    """A trial yet to be measured, in "both" `channels`, "odometry" or "ground_truth".
 
-    Args:
-        channels: "both", "odometry" or "ground_truth": what will be measured.
-        sigma: noise of the outside pose [m], [rad], which the start pose is known by after a second of standstill.
+    `sigma`: noise of the outside pose [m], [rad], which the start pose is known by after a second of standstill.
     """
     t = np.arange(0.0, candidate.command.t[-1] + 1e-9, SAMPLE_DT)
     blank = np.zeros_like(t)
@@ -185,11 +181,7 @@ def as_trial(candidate: Candidate, channels: str = "both", sigma: tuple[float, f
 
 
 def placement(path: np.ndarray, limits: Limits) -> tuple[float, float, float] | None:
-    """Start pose (x, y [m] from a corner of the room, heading [rad]) at which a path stays inside; None without one.
-
-    Args:
-        path: (T, 2) positions [m] seen from the start pose.
-    """
+    """Start pose (x, y [m] from a corner of the room, heading [rad]) that keeps a path (T, 2) [m] inside, or None."""
     length, width = (side - 2 * limits.margin for side in limits.room)
     best: tuple[float, tuple[float, float, float]] | None = None
     for yaw in np.deg2rad(np.arange(0.0, 180.0, 5.0)):

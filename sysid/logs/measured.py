@@ -25,13 +25,12 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.command_timeout import with_own_timeout
-from sysid.logs.gyro import told_sign, with_sign
+from sysid.logs.gyro import sign_shown, with_sign
 from sysid.logs.log import hash_files, load_log
-from sysid.logs.lost_pose import without_lost
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
 from sysid.logs.sources import about
-from sysid.logs.standing import without_standing
 from sysid.logs.streams import without_held
+from sysid.logs.unusable import without_lost, without_standing
 from sysid.logs.windows import in_windows
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import ARRAY_BYTES, LONGEST_REASON, csv_rows, read_arrays, read_gzip, read_text
@@ -52,13 +51,10 @@ CONVERT = "Convert the original again"
 ORIGINAL = "Use the original file."
 DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
 MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
-FRAME_SAMPLES = 5
-"""Samples whose mean yaw the converter of the DRIVE windows took for the frame of their positions."""
+FRAME_SAMPLES = 5  # samples whose mean yaw the converter of the DRIVE windows took for the frame of their positions
 RARE = 0.5  # of an update, by which intervals that a run does not show are counted
-BREAK = 0.5
-"""Probability of a lost update from which the motion over a joint is not compared bin by bin."""
-HELD = 1e-9
-"""Difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample."""
+BREAK = 0.5  # probability of a lost update from which the motion over a joint is not compared bin by bin
+HELD = 1e-9  # difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample
 ROBOTS = ("robot1", "robot2", "robot3", "robot4", "robot5")
 MRCLAM_WINDOW = 15.0  # s
 MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
@@ -88,11 +84,7 @@ def mrclam_files(folder: Path, robot: str, kind: str) -> list[Path]:
 
 
 def mrclam_robots(keys: Sequence[str]) -> tuple[int, ...]:
-    """Numbers of the robots that selections name: robot1 or one of its trials.
-
-    Raises:
-        ValueError: one names none.
-    """
+    """Numbers of the robots that selections name: robot1 or one of its trials; ValueError where one names none."""
     robots = [key.split("/")[0] for key in keys]
     for key, robot in zip(keys, robots, strict=True):
         if robot not in ROBOTS:
@@ -120,11 +112,7 @@ def drive_files(folder: Path) -> dict[str, Path]:
 
 
 def drive_selection(folder: Path, keys: Sequence[str]) -> tuple[str, ...]:
-    """Runs that selections name: RUN, one of its trials, or GROUP.
-
-    Raises:
-        FileNotFoundError: one names none.
-    """
+    """Runs that selections name: RUN, one of its trials, or GROUP; FileNotFoundError where one names none."""
     runs = drive_files(folder)
     chosen: list[str] = []
     for key in keys:
@@ -142,18 +130,16 @@ def drive_group(run: str) -> str:
 
 
 def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
-    """Load DRIVE runs of one robot.
+    """Load DRIVE runs of one robot from a folder of .npz and .csv.gz files: a trial per window, named
+    RUN/STEP.WINDOW.
 
     Args:
-        folder: folder with the .npz and .csv.gz files.
         runs: file stems, or groups of them, e.g. ("warthog_sand_1",).
         chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the motion
             is then that of wheels and gyro, by its probability, and the note on the log states how often and how much.
 
-    Returns:
-        One trial per window, named RUN/STEP.WINDOW; `fields["gyro"]` has the mean gyro yaw rate of each window and
-        `fields["yaw_rate"]` all of it: times [s] and rates [rad/s].
-        `fields["pose_stamps"]` is "receipt": how old a pose is at its stamp is not known.
+    `fields`: "gyro" has the mean gyro yaw rate of each window, "yaw_rate" all of it (times [s], rates [rad/s]), and
+    "pose_stamps" is "receipt": how old a pose is at its stamp is not known.
     """
     folder = Path(folder)
     runs, files = drive_selection(folder, runs), drive_files(folder)
@@ -213,7 +199,7 @@ def _drive_windows(path: Path, run: str, chained: bool
     wheel_v, wheel_omega = twist_from_wheels(spec, blocks["left_wheel_vel"], blocks["right_wheel_vel"])
     x, y, yaw = in_first_frame(blocks["icp_x"], blocks["icp_y"], blocks["icp_yaw"])
     gyro, count = blocks["imu_yaw"], len(x)
-    sign = told_sign([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
+    sign = sign_shown([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
     gyro *= sign or 1.0
     joints = _joints(x, y, yaw, wheel_v, gyro) if chained else None
     length = DRIVE_STEP_ROWS if chained else 1
@@ -404,9 +390,7 @@ def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial],
 
 
 def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
-    """Numbers by column (nan where there is none), times and whether calibrating, of a continuous log.
-
-    Its first row is filler and left out.
+    """Numbers by column (nan where none), times and whether calibrating, of a continuous log; its first row is filler.
     """
     rows = csv_rows(path, read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}."))
     header = next(rows, (0, []))[1]
@@ -559,7 +543,7 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
              chained: bool = False) -> Log:
     """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials.
 
-    Training trials of DRIVE whose outside pose was lost are left out (`sysid.logs.lost_pose`), and so are a
+    Training trials of DRIVE whose outside pose was lost are left out (`sysid.logs.unusable`), and so are a
     dataset's rows that were held between updates (`sysid.logs.streams.without_held`). A base that stops by itself where
     no command comes does so in replays too (`sysid.logs.command_timeout`). A note says each.
     """

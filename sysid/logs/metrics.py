@@ -34,8 +34,7 @@ class Errors:
     yaw: float | None  # rad
 
     def as_dict(self) -> dict[str, float | None]:
-        return {"trajectory": self.trajectory, "velocity": self.velocity,
-                "angular_velocity": self.angular_velocity, "yaw": self.yaw}
+        return {metric: getattr(self, metric) for metric in METRICS}
 
 
 METRICS = ("trajectory", "velocity", "angular_velocity", "yaw")
@@ -48,24 +47,28 @@ def rmse(error: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(error))))
 
 
+def errors_of(trial: Trial, prediction: Prediction) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """channel -> metric -> times (T,) [s] and errors (T,) of what was measured."""
+    found: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
+    for channel in CHANNELS:
+        measured, simulated = getattr(trial, channel), getattr(prediction, channel)
+        if measured is None or simulated is None:
+            continue
+        mine = {}
+        if measured.x is not None and measured.y is not None and measured.yaw is not None:
+            mine["trajectory"] = measured.t, np.hypot(simulated.x - measured.x, simulated.y - measured.y)
+            mine["yaw"] = measured.t, simulated.yaw - measured.yaw
+        if channel == "odometry":
+            mine["velocity"] = measured.t, simulated.v - measured.v
+            mine["angular_velocity"] = measured.t, simulated.omega - measured.omega
+        found[channel] = mine
+    return found
+
+
 def score(trial: Trial, prediction: Prediction) -> dict[str, Errors]:
     """Errors per channel ("ground_truth", "odometry") of those that were measured."""
-    scores = {}
-    if trial.ground_truth is not None and prediction.ground_truth is not None:
-        measured, simulated = trial.ground_truth, prediction.ground_truth
-        scores["ground_truth"] = Errors(
-            rmse(np.hypot(simulated.x - measured.x, simulated.y - measured.y)), None, None,
-            rmse(simulated.yaw - measured.yaw))
-    if trial.odometry is not None and prediction.odometry is not None:
-        odometry, simulation = trial.odometry, prediction.odometry
-        trajectory = yaw = None
-        if odometry.x is not None and odometry.y is not None and odometry.yaw is not None:
-            assert simulation.x is not None and simulation.y is not None and simulation.yaw is not None
-            trajectory = rmse(np.hypot(simulation.x - odometry.x, simulation.y - odometry.y))
-            yaw = rmse(simulation.yaw - odometry.yaw)
-        scores["odometry"] = Errors(trajectory, rmse(simulation.v - odometry.v),
-                                    rmse(simulation.omega - odometry.omega), yaw)
-    return scores
+    return {channel: Errors(**{metric: rmse(mine[metric][1]) if metric in mine else None for metric in METRICS})
+            for channel, mine in errors_of(trial, prediction).items()}
 
 
 def ideal_replay(trial: Trial) -> Prediction:
@@ -108,18 +111,17 @@ def relative_pose(stream: PoseStream, start: Start) -> np.ndarray:
 
 
 def replicate_groups(trials: tuple[Trial, ...]) -> list[list[Trial]]:
-    """Trials that are true replicates: of one manoeuvre with the same commands at the same times after its first
-    motion, two at least."""
+    """Trials that are true replicates: of one manoeuvre with the same commands after its first motion, two at least."""
     numbered = [trial for trial in trials if trial.name != trial.manoeuvre == manoeuvre_of(trial.name)]
     return [[numbered[i] for i in group] for group in same_course(numbered) if len(group) > 1]
 
 
 def replicate_noise(trials: tuple[Trial, ...]) -> dict[str, np.ndarray] | None:
-    """Pooled standard deviation between replicates, which no model of the mean motion can beat.
+    """Pooled standard deviation between replicates, which no model of the mean motion can beat; None without
+    replicates.
 
-    Returns:
-        "ground_truth" (3,) of x, y [m], yaw [rad] and "odometry" (5,) of x, y, yaw, v, omega, in the frame of each
-        trial's start; channels without data are nan. None when there are no replicates.
+    "ground_truth" (3,) of x, y [m], yaw [rad] and "odometry" (5,) of x, y, yaw, v, omega, in the frame of each trial's
+    start; channels without data are nan.
     """
     groups = replicate_groups(trials)
     if not groups:
@@ -162,10 +164,10 @@ def noise_floor(trials: tuple[Trial, ...]) -> dict[str, dict[str, float | None]]
 
 
 def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, float | None]]:
-    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by.
+    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by; else
+    empty.
 
-    A manoeuvre's replicates count whichever part they are in: a single held-out drive has its replicates among the
-    training trials, and drives that turn a lot differ by far more than others. Empty where no drive has any.
+    Replicates count whichever part they are in: drives that turn a lot differ by far more than others.
     """
     manoeuvres = [one.manoeuvre for one in trials if one.held_out is held_out]
     each = {name: noise_floor(tuple(one for one in trials if one.manoeuvre == name)) for name in set(manoeuvres)}

@@ -1,7 +1,6 @@
 """The next three drives of a log: manoeuvres that show what it lacks, slow, ramped and within a stated space.
 
-They are scripts, `t,v,omega` as in command.csv, which `bridge.manoeuvre` drives: they keep to the floor as it measures
-it. No vehicle model is asked; `sysid.design` plans with a fitted one.
+They are scripts, `t,v,omega` as in command.csv, for `bridge.manoeuvre`. No vehicle model is asked.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import numpy as np
 from sysid.logs.coverage import Blind
 from sysid.logs.manoeuvre_library import FRACTIONS, REVERSING, make_command
 from sysid.logs.records import Command, Log
-from whill_mjx.vehicle.specs import VehicleSpec
 
 COUNT = 3
 RAMPS = (0.5, 1.0)  # m/s^2 and rad/s^2 that no script exceeds
@@ -24,8 +22,7 @@ SIZES = (1.0, 0.7, 0.5, 0.35)  # of the speeds that are tried where the floor is
 LONGEST = 20.0  # s of motion
 DT = 0.1  # s between commands
 UNCERTAINTY, REACTION = 0.15, 0.25
-"""How much faster or slower the vehicle may be than commanded, and for how long [s] it drives on before a stop takes
-effect: those of `bridge.manoeuvre`, so that it takes the scripts."""
+"""How much faster or slower than commanded, and how long [s] after a stop, it may drive, as `bridge.manoeuvre`."""
 STEP = 0.05  # s of the floor that is needed
 SHARE = 0.5  # of the vehicle's limits that a script uses
 FASTEST = (0.5, 0.8)  # m/s and rad/s that no script exceeds by default
@@ -33,8 +30,7 @@ CURES = {
     "no straight motion": "straight", "no turn": "arcs", "turns to one side only": "square", "no reversal": "reversal",
     "one speed": "step_ladder", "steps of hardly any different size": "step_ladder",
     "no slow crossing of zero": "slow_sine", "one heading of the room": "square",
-}
-"""Cause of a blind spot -> manoeuvre that removes it, in order of what it hides."""
+}  # cause of a blind spot -> manoeuvre that removes it, in order of what it hides
 OTHERS = ("random_steps", "figure_eight", "stop_and_go", "circle", "turn_ladder")
 """What is driven where nothing is missing: manoeuvres that the log does not have yet come first."""
 
@@ -46,27 +42,25 @@ class NextDrive:
     name: str
     why: str
     command: Command
-    floor: tuple[float, float]
-    """Free floor that it needs [m], along its first heading and across it, margins included."""
-    radius: float
-    """Of the vehicle around its drive-axle centre [m], as the floor was reckoned."""
+    floor: tuple[float, float]  # free floor that it needs [m], along its first heading and across it, margins included
+    radius: float  # of the vehicle around its drive-axle centre [m], as the floor was reckoned
 
 
 def next_drives(
     log: Log, blind: Sequence[Blind], space: tuple[float, float] = (4.0, 4.0), v_max: float | None = None,
     radius: float | None = None,
 ) -> list[NextDrive]:
-    """Up to three drives that show what a log lacks, each within the space.
+    """Up to three drives that show the `blind` spots of a log, each within the space.
 
     Args:
-        blind: its blind spots.
         space: length and width of the free floor [m].
         v_max: fastest speed [m/s]; by default half of the vehicle's limit, at most 0.5 m/s.
         radius: of the vehicle around its drive-axle centre [m]; by default that of its nominal body.
     """
     v = v_max or min(SHARE * log.spec.v_max, FASTEST[0])
     speeds = v, min(SHARE * log.spec.omega_max, FASTEST[1])
-    radius = radius or reach_of_body(log.spec)
+    body = math.hypot(log.spec.body_length, log.spec.body_width / 2)  # wherever the axle is
+    radius = radius or math.ceil(20 * body) / 20
     causes = {one.cause for one in blind}
     wanted = {name: cause for cause, name in reversed(CURES.items()) if cause in causes}
     order = [(name, wanted[name]) for name in dict.fromkeys(CURES.values()) if name in wanted]
@@ -83,17 +77,9 @@ def next_drives(
     return found
 
 
-def reach_of_body(spec: VehicleSpec) -> float:
-    """Distance from the drive-axle centre that no part of the body is beyond, wherever the axle is [m]."""
-    return math.ceil(20 * math.hypot(spec.body_length, spec.body_width / 2)) / 20
-
-
 def needed_floor(command: Command, radius: float) -> tuple[float, float]:
-    """Length and width of the floor that a vehicle may need for commands, along its first heading and across it [m].
-
-    Speed and yaw rate may each be UNCERTAINTY too large or too small; each place is widened by the body's radius and by
-    what is driven until a stop takes effect.
-    """
+    """Length and width of the floor that a vehicle may need for commands, along its first heading and across it [m]:
+    with errors of UNCERTAINTY, the body's radius, and what is driven until a stop takes effect."""
     t = np.arange(0.0, command.t[-1] + STEP, STEP)
     held = np.maximum(np.searchsorted(command.t, t + 1e-9, side="right") - 1, 0)
     low, high = np.full(2, -radius), np.full(2, radius)

@@ -1,9 +1,7 @@
 """Odometry that is computed at fixed times and reported at others: each row is of the frame before it.
 
-Wheel odometry is computed every few milliseconds and sent at another rate. A row then says where the vehicle was at
-the latest frame, and its stamp is up to a period later: at 1 m/s and 20 ms, 2 cm. Where these ages differ from row to
-row they show in steady driving, as steps that are not as long as the time between their stamps: no model is needed.
-Ages that all rows share do not show; a fit has `sensor_delay` for them.
+A row's stamp is up to a frame later than what it says: at 1 m/s and 20 ms, 2 cm. Where these ages differ from row to
+row they show in steady driving, as uneven steps. Ages that all rows share do not; a fit has `sensor_delay` for them.
 """
 
 from __future__ import annotations
@@ -42,11 +40,7 @@ class Stretches:
 
 
 def at_frames(trials: Sequence[Trial], period: float | None) -> tuple[Trial, ...]:
-    """Trials with the rows of their odometry at the times of their frames: the latest that the steps allow.
-
-    Args:
-        period: between frames [s]; None changes nothing.
-    """
+    """Trials with the odometry's rows at the times of their frames, the latest that steps of `period` [s] allow."""
     return tuple(trials) if period is None else tuple(_at_frames(trial, period) for trial in trials)
 
 
@@ -85,9 +79,7 @@ def find_period(trials: Sequence[Trial]) -> float | None:
 def stretches(trial: Trial, number: int = 0, largest: float | None = None) -> Stretches | None:
     """Where a trial's odometry shows steady driving, forward or turning; None where it never does.
 
-    Args:
-        number: of the trial.
-        largest: step that a steady stretch may have [s]; by default its command must have been in force for a while.
+    `largest`: step that a steady stretch may have [s]; by default its command must have been in force for a while.
     """
     stream = trial.odometry
     if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < ROWS:
@@ -118,11 +110,7 @@ def stretches(trial: Trial, number: int = 0, largest: float | None = None) -> St
 
 
 def unexplained(part: Stretches, period: float, group: np.ndarray, phases: int = PHASES) -> float:
-    """Squared ways [m^2 or rad^2] that frames of a period [s] leave, each group (S,) at its best phase.
-
-    Args:
-        group: rising numbers.
-    """
+    """Squared ways [m^2 or rad^2] that frames of a period [s] leave, each group (S,) at its best phase."""
     left = _left(part, period, np.arange(phases) / phases)
     return float(np.add.reduceat(left, np.flatnonzero(np.diff(group, prepend=-1)), axis=1).min(0).sum())
 

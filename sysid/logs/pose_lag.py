@@ -1,9 +1,8 @@
 """How late the outside pose is, found without a vehicle model.
 
-The outside yaw follows the integral of a rate measured on the vehicle, and its path that of the speed; how much later
-is found from whole drives, with one factor for all. A yaw rate of the body (a gyro) settles it. The odometry shows the
-wheels, and a body that lags behind them looks like a late pose; where it is all there is, the delay has to beat a
-first-order lag. Before a drive the vehicle went on as in its first instant, as `whill_mjx.effects.pose_delay` has it.
+The outside yaw follows the integral of a rate measured on the vehicle, its path that of the speed; how much later is
+found from whole drives. A gyro settles it. The odometry shows the wheels, and a body that lags behind them looks like a
+late pose: the delay then has to beat a first-order lag. Before a drive the vehicle went on as in its first instant.
 """
 
 from __future__ import annotations
@@ -22,34 +21,26 @@ GRID = np.linspace(0.0, 1.0, 41)  # s
 FLIPS = 20000
 TINY = 1e-12
 
-Rates = Mapping[str, tuple[np.ndarray, np.ndarray]]
-"""Trial -> times (T,) [s] and yaw rates (T,) [rad/s] of the body."""
+Rates = Mapping[str, tuple[np.ndarray, np.ndarray]]  # trial -> times (T,) [s] and yaw rates (T,) [rad/s] of the body
 
 
 @dataclass(frozen=True)
 class PoseLag:
     """A delay of the outside pose."""
 
-    delay: float
-    """Of all drives [s]."""
+    delay: float  # of all drives [s]
     low: float
-    high: float
-    """95 % interval of it, from blocks left out in turn [s]."""
+    high: float  # 95 % interval of it, from blocks left out in turn [s]
     p: float
     """Probability of so much better a prediction of held-back blocks if the delay meant nothing: signs of blocks."""
-    share: float
-    """Share of the held-back error that it removes."""
+    share: float  # share of the held-back error that it removes
 
 
 def pose_lag(trials: Sequence[Trial], blocks: Sequence[Sequence[int]], rates: Rates | None = None) -> PoseLag | None:
     """Delay of the outside pose, chosen on every second block and judged on the others, and the other way round.
 
-    Args:
-        blocks: trials that are near one another, by index.
-        rates: yaw rates of the body; without them the odometry is taken.
-
-    Returns:
-        None where the drives show nothing: no odometry, no turns, fewer than two blocks.
+    `blocks`: indices of trials near one another; `rates`: yaw rates of the body, else the odometry's. None where the
+    drives show nothing: no odometry, no turns, fewer than two blocks.
     """
     sums = {i: one for i, trial in enumerate(trials) if (one := _sums(trial, rates)) is not None}
     usable = [block for block in ([i for i in block if i in sums] for block in blocks) if block]

@@ -88,11 +88,6 @@ class GyroStream:
         """(T, 1) of the turn."""
         return self.turn[:, None]
 
-    def until(self, end: float) -> GyroStream:
-        """The samples up to a time [s]."""
-        inside = self.t <= end
-        return GyroStream(self.t[inside], self.turn[inside])
-
 
 @dataclass(frozen=True)
 class Start:
@@ -201,8 +196,7 @@ def held_from_middle(rates: Command) -> Command:
 
 
 def with_timeout(command: Command, timeout: float) -> Command:
-    """The commands that a base takes which stops where none has come for a time [s]: standstill in each longer pause,
-    and after the last."""
+    """The commands that a base takes which stops where none has come for a time [s]."""
     pauses = np.diff(np.append(command.t, np.inf)) > timeout + 1e-6
     stop = pauses & ((command.v != 0) | (command.omega != 0))
     t = np.concatenate([command.t, command.t[stop] + timeout])
@@ -212,8 +206,7 @@ def with_timeout(command: Command, timeout: float) -> Command:
 
 
 def manoeuvre_of(trial_name: str) -> str:
-    """Name without its replicate number, the number of a drive within a recording, or a recorder's date: circle_2,
-    circle_2-03 and circle_2024_05_31-10_20_30 -> circle."""
+    """Name without its replicate, drive number or date: circle_2, circle_2-03, circle_2024_05_31-10_20_30 -> circle."""
     recording = re.sub(r"(?<=\w)-\d{2,3}$", "", trial_name)
     undated = re.sub(r"(?<=\w)_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d(_\d+)?$", "", recording)
     return re.sub(r"_\d+$", "", recording) if undated == recording else undated

@@ -1,7 +1,7 @@
 """Drives that repeat one another: the same commands as functions of time, whenever the recording began.
 
-A dataset's commands repeat exactly. Those of a bag never do: the recording begins at another moment, messages come a
-little earlier or later, and some get lost.
+A dataset's commands repeat exactly. A bag's never do: it begins at another moment, and messages come early, late,
+never.
 """
 
 from __future__ import annotations
@@ -92,11 +92,7 @@ def shift_between(a: Course, b: Course) -> float | None:
 
 
 def near(a: Course, b: Course, most: float) -> bool:
-    """Whether the commands of two drives are nearly the same function of time, channel by channel.
-
-    Args:
-        most: how far apart the drives may begin in their recordings [s].
-    """
+    """Whether the commands of two drives, which begin at most `most` s apart in recordings, are nearly the same."""
     if len(a.command.t) == len(b.command.t) and np.allclose(a.command.t, b.command.t, atol=ROUNDED):
         ours, theirs = a.command.table[:, 1:], b.command.table[:, 1:]
     elif not (a.moves and b.moves and abs(a.begin - b.begin) <= most + EXACT
@@ -144,11 +140,7 @@ def may_be_alike(a: Glance, b: Glance) -> bool:
 
 
 def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]]:
-    """Indices of trials of one manoeuvre with the same commands, in order of first appearance; single ones too.
-
-    Args:
-        most: how much earlier or later than in the first of them the commands may come in the recording [s].
-    """
+    """Indices of trials of one manoeuvre with the same commands, at most `most` s apart; single ones too."""
     courses = [course_of(trial) for trial in trials]
     glances = [glance(course) for course in courses]
     groups: list[list[int]] = []

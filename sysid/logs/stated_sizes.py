@@ -14,18 +14,14 @@ from whill_mjx.vehicle.specs import VehicleSpec
 
 USUAL = 0.06  # share by which data sheets, worn tyres and creeping wheels make a size differ
 
-Gain = tuple[float, float]
-"""Outside motion over that of the odometry, and its standard error."""
+Gain = tuple[float, float]  # outside motion over that of the odometry, and its standard error
 
 
 def wrong_sizes(trials: Sequence[Trial], spec: VehicleSpec, reach: float) -> list[str]:
     """Sentences on a wheel radius and a track that are further off than is usual.
 
-    The odometry goes by the nominal radius and turns by the ratio of radius and track. Whether these are wrong or it
-    has a scale of its own, the outside pose does not show; a ruler does.
-
-    Args:
-        reach: how far from the axle's centre a tracked point may be [m].
+    Whether these are wrong or the odometry has a scale of its own, the outside pose does not show; a ruler does.
+    `reach`: how far from the axle's centre a tracked point may be [m].
     """
     each = [gains for trial in trials if (gains := _gains(trial, reach)) is not None]
     way, turn = (_pooled([one[k] for one in each if one[k] is not None]) for k in (0, 1))

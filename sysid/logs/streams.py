@@ -1,8 +1,7 @@
 """Rates, gaps, repeated samples and clock offsets of measured streams.
 
-Offsets come from shifting one signal against the other until they fit best. Between command and motion the vehicle's
-own response lies in between; a first-order lag is therefore fitted together with the shift, and what remains is the sum
-of clock offset and transport delay, which no drive can separate.
+Offsets come from shifting one signal against the other. Between command and motion a first-order lag, the vehicle's own
+response, is fitted with the shift; the rest is clock offset and transport delay, which no drive can separate.
 """
 
 from __future__ import annotations
@@ -28,16 +27,11 @@ class StreamQuality:
     """How regularly one stream was sampled."""
 
     samples: int
-    period: float
-    """Median interval [s]."""
-    jitter: float
-    """Half the spread of the middle 90 % of the intervals that are no gaps [s]."""
-    longest: float
-    """Longest interval [s]."""
-    gaps: int
-    """Intervals longer than GAP periods."""
-    missing: float
-    """Share of samples that the mean interval outside gaps promises and the stream lacks."""
+    period: float  # median interval [s]
+    jitter: float  # half the spread of the middle 90 % of the intervals that are no gaps [s]
+    longest: float  # longest interval [s]
+    gaps: int  # intervals longer than GAP periods
+    missing: float  # share of samples that the mean interval outside gaps promises and the stream lacks
     held: float
     """Share of samples that repeat the one before while the command moves: of the pose or of the speeds, whichever
     repeats more; nan for commands."""
@@ -56,7 +50,7 @@ def quality(
     Args:
         t: (T,) times [s], increasing.
         values: tables (T, C) whose repeated rows count, each for itself: a pose may be updated less often than speeds.
-        moving: (T,) bool, where the vehicle should move: a vehicle at rest rightly repeats its pose.
+        moving: (T,) bool, where the vehicle should move: at rest it rightly repeats its pose.
     """
     steps = np.diff(t)
     period = float(np.median(steps))
@@ -92,11 +86,9 @@ def trial_quality(trial: Trial) -> dict[str, StreamQuality]:
 
 
 def without_held(trial: Trial) -> Trial:
-    """The trial without rows that repeat the one before while the vehicle moves: held between two updates, they would
-    be scored again, each later than it was measured.
+    """The trial without rows held between two updates, which would be scored again, each later than it was measured.
 
-    An outside pose should move where the command does, a row of odometry where it reports a speed itself: wheels that
-    have not begun to turn rightly repeat their row.
+    An outside pose should move where the command does, a row of odometry where it reports a speed itself.
     """
     pose, odometry = trial.ground_truth, trial.odometry
     if pose is not None:
@@ -129,14 +121,10 @@ def _moving(v: np.ndarray, omega: np.ndarray) -> np.ndarray:
 class Shift:
     """How much later a signal is than its reference."""
 
-    delay: float
-    """[s]; positive where the signal comes later."""
-    lag: float
-    """Time constant of the first-order response that fits best [s]; 0 where none was asked for."""
-    correlation: float
-    """Of the two signals at this shift; negative where one has the other's sign reversed."""
-    gain: float
-    """Signal over reference at this shift."""
+    delay: float  # [s]; positive where the signal comes later
+    lag: float  # time constant of the first-order response that fits best [s]; 0 where none was asked for
+    correlation: float  # of the two signals at this shift; negative where one has the other's sign reversed
+    gain: float  # signal over reference at this shift
 
 
 def find_shift(
@@ -144,9 +132,8 @@ def find_shift(
 ) -> Shift | None:
     """Shift of a signal (T,) against its reference (T,), both every dt seconds, within +-reach seconds.
 
-    Of all shifts and lags the pair with the largest correlation, of either sign, is taken and refined between grid
-    points. None where either signal does not vary away from its ends, or where the best shift is as far as the search
-    went.
+    Of all shifts and lags the pair with the largest correlation, of either sign, is refined between grid points. None
+    where a signal does not vary away from its ends, or where the best shift is as far as the search went.
     """
     count = round(reach / dt)
     if len(signal) < 4 * count or min(np.std(reference), np.std(signal)) < 1e-9:
@@ -210,8 +197,7 @@ def clock_shift(trial: Trial) -> dict[str, Shift]:
 def speeds(trial: Trial, stream: str, smooth: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Times (G,) [s] every GRID_DT with speed (G,) [m/s] and yaw rate (G,) [rad/s] of a stream; None where it has none.
 
-    Args:
-        smooth: average the odometry over the time that a usual pose is differenced over.
+    `smooth`: average the odometry over the time that a usual pose is differenced over.
     """
     source = trial.odometry if stream == "odometry" else trial.ground_truth
     if source is None or len(source.t) < 8 or source.t[-1] - source.t[0] < 4 * SMOOTHING:

@@ -59,12 +59,10 @@ class TextDrive:
     """One drive out of text files."""
 
     name: str
-    tables: dict[str, np.ndarray]
-    """"command", "odometry", "ground_truth": t [s] and the columns of docs/log_format.md."""
+    tables: dict[str, np.ndarray]  # "command", "odometry", "ground_truth": t [s] and the columns of docs/log_format.md
     columns: tuple[Column, ...]
     notes: tuple[str, ...]
-    measured_input: bool
-    """Whether the commands are measured wheel speeds."""
+    measured_input: bool  # whether the commands are measured wheel speeds
 
 
 def text_files(source: Path) -> list[list[Path]]:
@@ -80,15 +78,13 @@ def text_files(source: Path) -> list[list[Path]]:
 def read_drives(
     source: Path, said: Sequence[str], geometry: tuple[float, float], wheels: bool = False
 ) -> tuple[list[TextDrive], list[str]]:
-    """The drives of a CSV file, a TUM file or a folder of them, and notes on what is left out.
+    """The drives of a CSV file, a TUM file or a folder of them, and notes on what is left out; ValueError where none
+    is clear.
 
     Args:
         said: decisions, each ROLE=[FILE/]COLUMN[:UNIT]; the rest is guessed.
         geometry: wheel radius and track [m], of wheel speeds.
         wheels: take measured wheel speeds as the input, and leave commands out.
-
-    Raises:
-        ValueError: in one line, what is not clear, what was guessed and what to give.
     """
     groups: list[tuple[str, list[Table]]] = []
     refused: list[ValueError] = []
@@ -122,8 +118,7 @@ def join_drives(
     source: Path, groups: Sequence[tuple[str, list[Table]]], said: Sequence[str], geometry: tuple[float, float],
     wheels: bool = False,
 ) -> tuple[list[TextDrive], list[str]]:
-    """Drives of tables, by the name of each drive; otherwise as `read_drives`. One that is not clear does not keep out
-    the others."""
+    """Drives of tables by name, otherwise as `read_drives`; one that is not clear does not keep out the others."""
     units = shown_units([guess(tables, _said_of(tables, said)) for _, tables in groups]) if len(groups) > 1 else {}
     drives: list[TextDrive] = []
     refused: list[ValueError] = []
@@ -149,7 +144,7 @@ def read_table(path: Path) -> Table:
     comments = [line.lstrip("#% \t") for _, line in lines if line.lstrip().startswith(("#", "%"))]
     if not data:
         raise ValueError(f"{path}: no rows. Give a table of numbers with a line of names.")
-    split = _splitter(data[len(data) // 2][1])
+    split = next((one for one in ("\t", ";", ",") if one in data[len(data) // 2][1]), None)  # None: spaces
     data = _without_preamble(path, data, split)
     if stacked := _stacked_names([_cells(line, split) for _, line in data[:PREAMBLE]]):
         header, data = stacked[0], data[stacked[1] :]
@@ -225,11 +220,6 @@ def _texts(folder: Path) -> list[Path]:
                   and not path.name.lower().startswith(("readme", "license", ".")))
 
 
-def _splitter(line: str) -> str | None:
-    """Separator of a line's cells; None for spaces."""
-    return next((one for one in ("\t", ";", ",") if one in line), None)
-
-
 def _cells(line: str, split: str | None) -> list[str]:
     if '"' in line and split:  # a cell in quotes may hold the separator
         found = next(csv.reader([line], delimiter=split, skipinitialspace=True))
@@ -239,11 +229,8 @@ def _cells(line: str, split: str | None) -> list[str]:
 
 
 def _without_preamble(path: Path, data: list[tuple[int, str]], split: str | None) -> list[tuple[int, str]]:
-    """Lines from the first that has as many cells as most: above it a logger may say who it is.
-
-    Raises:
-        ValueError: above the first row stand names, but not as many as the row has cells.
-    """
+    """Lines from the first that has as many cells as most: above it a logger may say who it is. ValueError where the
+    names above it are more or fewer."""
     counts = [len(_cells(line, split)) for _, line in data]
     usual = Counter(counts).most_common(1)[0][0]
     first = counts.index(usual)
@@ -291,8 +278,7 @@ def _numbers(cells: Sequence[str]) -> np.ndarray:
 def _seconds(cell: str, day_first: bool) -> float:
     """Seconds since 1970 of a date with a time of day, since midnight, or of minutes; nan of anything else.
 
-    Args:
-        day_first: a date that does not begin with its year begins with the day, not with the month.
+    `day_first`: a date that does not begin with its year begins with the day, not with the month.
     """
     if match := re.fullmatch(r"(?:(\d{1,2}):(?=\d+:))?(\d{1,2}):(\d{2}(?:[.,]\d+)?)", cell):
         if match[1] or not match[3].isdigit():  # 12:30 may be hours
@@ -501,8 +487,7 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
 def _stream(
     stream: str, tables: Sequence[Table], columns: Sequence[Column]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Rows of a stream in SI units in order of time, by quantity and "t", and notes; those with an empty cell are left
-    out."""
+    """Rows of a stream in SI units in order of time, by quantity and "t", without those with an empty cell; notes."""
     mine = [one for one in columns if one.role.startswith(f"{stream}.")]
     if not mine:
         return {}, []
@@ -547,8 +532,7 @@ def _stream(
 
 
 def _spread(t: np.ndarray) -> np.ndarray | None:
-    """Times (T,) of rows that came evenly, from times that were rounded down to a coarser step; None where they were
-    not."""
+    """Times (T,) of rows that came evenly, from times rounded down to a coarser step; None where they were not."""
     first = np.flatnonzero(np.diff(t, prepend=-np.inf) > 1e-6)
     if len(first) < 3 or len(first) > len(t) / 2:
         return None
@@ -566,8 +550,7 @@ def _spread(t: np.ndarray) -> np.ndarray | None:
 
 
 def _check_clock(file: str, t: np.ndarray) -> list[str]:
-    """Notes on a stream's time (T,), or a refusal where it goes back by more than rows out of order do: sorted, it
-    would mix two moments."""
+    """Notes on a stream's time (T,); ValueError where it goes back by more than rows out of order do."""
     steps = np.diff(t)
     if (steps < 0).sum() > len(steps) / 2:
         return [f"{file}: its newest row comes first; its rows are turned round"]

@@ -1,8 +1,7 @@
 """Motion of two driven wheels out of what drivers publish of them: joint states, and the state of a WHILL Model CR2.
 
-The chair's state (whill_msgs/ModelCr2State) has motor angles in rad that wrap at pi, speeds in km/h that are low-pass
-filtered, a right motor that counts down while the chair drives forward, and no header. It comes at 2 to 20 Hz; at 2 Hz
-a wheel makes half a turn between two of them, and the speeds say which whole turn it was.
+The chair's state (whill_msgs/ModelCr2State, 2 to 20 Hz, no header) has motor angles in rad that wrap at pi, low-pass
+filtered speeds in km/h, and a right motor that counts down forward. At 2 Hz the speeds say which whole turn it was.
 """
 
 from __future__ import annotations
@@ -23,8 +22,7 @@ int32 power_on
 int32 speed_mode_indicator
 int32 error
 """
-JOYSTICK_FIELDS = "int8 joy_front\nint8 joy_side\n"
-"""That newer drivers add."""
+JOYSTICK_FIELDS = "int8 joy_front\nint8 joy_side\n"  # that newer drivers add
 KMH = 1 / 3.6  # m/s
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 COARSE = 0.15  # s between states, above which speeds are too coarse to identify a drive from
@@ -37,13 +35,8 @@ def chair_row(state: Any) -> tuple[float, float, float, float]:
 
 
 def chair_odometry(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
-    """Odometry (T, 5), x, y, yaw, v and omega, of a chair's states.
-
-    Args:
-        t: times of receipt (T,) [s], increasing.
-        rows: `chair_row` of each (T, 4).
-        wheel_radius, track: nominal [m].
-    """
+    """Odometry (T, 5) x, y, yaw, v, omega of a chair's states: times of receipt (T,) [s] and `chair_row` of each (T,
+    4)."""
     dt = np.diff(t)[:, None]
     expected = (rows[1:, 2:] + rows[:-1, 2:]) / 2 * dt / wheel_radius
     turned = expected + np.remainder(np.diff(rows[:, :2], axis=0) - expected + np.pi, 2 * np.pi) - np.pi
@@ -51,8 +44,7 @@ def chair_odometry(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: 
 
 
 def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
-    """(T, 2) v and omega of wheels: rows (T, 4) of left and right angle [rad] and rate [rad/s], rates nan where the
-    driver leaves them out."""
+    """(T, 2) v and omega of wheels: rows (T, 4) of left and right angle [rad] and rate [rad/s], or nan for rates."""
     rates = rows[:, 2:]
     if not np.isfinite(rates).all():
         rates = np.gradient(np.unwrap(rows[:, :2], axis=0), t, axis=0)
@@ -60,10 +52,8 @@ def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: flo
 
 
 def joint_row(state: Any) -> tuple[float, float, float, float]:
-    """Left and right angle and rate of a JointState's wheels, by the names of its joints; infinite where it has none.
-
-    Several wheels of one side count as their mean.
-    """
+    """Left and right angle and rate, means over a side, of a JointState's wheels by their joints' names; inf without
+    any."""
     sides = wheel_joints(state.name)
     if sides is None:
         return (float("inf"),) * 4

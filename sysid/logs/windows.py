@@ -1,7 +1,6 @@
 """Long drives in windows, each from where the vehicle was measured to be.
 
-Over minutes an open-loop replay drifts by more than any parameter moves it, and a single drive shows no noise: nothing
-was held back from it. Windows of it are drives of their own, as those of the published measured sets are.
+Over minutes an open-loop replay drifts by more than any parameter moves it, and a single drive shows no noise.
 """
 
 from __future__ import annotations
@@ -17,16 +16,14 @@ from sysid.logs.replicates import same_course
 
 WINDOW = 20.0
 """Greatest length of a window [s]: long for a vehicle's delays, lags and turns, short for the drift of a replay."""
-LONG = 6 * WINDOW
-"""Length from which a drive is cut [s]."""
+LONG = 6 * WINDOW  # length from which a drive is cut [s]
 AROUND = 0.25
 """Time before and after a window's start [s] over which its speeds, and its pose from outside, are taken as a line."""
 TINY = 1e-9
 
 
 def in_windows(log: Log) -> Log:
-    """The log with its long drives in windows, and a note where there are any. Drives that are repeated stay whole:
-    they show the noise."""
+    """The log with its long drives in windows, and a note. Repeated drives stay whole: they show the noise."""
     if all(trial.duration < LONG for trial in log.trials):
         return log
     again = {log.trials[i].name for group in same_course(log.trials) if len(group) > 1 for i in group}
@@ -36,23 +33,18 @@ def in_windows(log: Log) -> Log:
         if trial.duration < LONG or trial.name in again:
             trials.append(trial)
             continue
-        parts = windows_of(trial)
+        length = length_of(trial)
+        every = [_window(trial, k, length) for k in range(round(trial.duration / length))]
+        parts = [one for one in every if one is not None]
         trials += parts
         notes.append(f"{trial.name} lasts {trial.duration:.0f} s: it is taken as {len(parts)} windows of "
-                     f"{length_of(trial):.3g} s, each from where it was measured to be")
+                     f"{length:.3g} s, each from where it was measured to be")
     return replace(log, trials=tuple(trials), notes=tuple(notes))
 
 
 def length_of(trial: Trial) -> float:
     """Length of a trial's windows [s]: it is cut into equal ones, so that nothing of its end is lost."""
     return trial.duration / np.ceil(trial.duration / WINDOW - TINY)
-
-
-def windows_of(trial: Trial) -> list[Trial]:
-    """Windows of a trial that have anything to score, in order."""
-    length = length_of(trial)
-    found = [_window(trial, k, length) for k in range(round(trial.duration / length))]
-    return [one for one in found if one is not None]
 
 
 def _window(trial: Trial, number: int, length: float) -> Trial | None:

@@ -14,8 +14,8 @@ from sysid.errors.features import Features, bin_width, make_features
 from sysid.errors.noise import BIN_SHIFT, roughness
 from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
+from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_all_cores, on_processor
-from sysid.replay.quotients import Quotients
 from sysid.replay.records import ODOMETRY, POSE, TURN, Batch, FreeVehicle, Measured, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
 from whill_mjx.effects.supply_sag import ROUND

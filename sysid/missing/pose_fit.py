@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from sysid.errors.pose_objective import Objective, estimate_noise
-from sysid.errors.space import Space
+from sysid.errors.space import Residuals, Space
 from sysid.logs.metrics import replicate_noise
 from sysid.logs.records import Trial
 from sysid.missing.days import difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
-from sysid.replay.quotients import Quotients
+from sysid.replay.arrays import Quotients
 from sysid.replay.records import Measured, Simulated
 from sysid.search import least_squares
 
@@ -40,6 +40,8 @@ class PoseReplay:
         return Quotients.central(values, self.steps, -np.inf, np.inf).along(values, self.simulate)
 
 
+SEARCHES, WORTH = 6, 1e-3
+"""One after the other at most, and the share of the cost that one must gain for another to follow."""
 POOLED = 1.0
 """Degrees of freedom that the noise of all replicates counts as, beside those of a manoeuvre's own."""
 
@@ -86,14 +88,27 @@ def fit_poses(
 
     def objective(at: np.ndarray) -> Objective:
         replay: Any = PoseReplay(drives, held, tuple(space.names), difference_sizes(spread) * space.slope(at))
-        return Objective(replay, space, drives.trials, measured, noise)
+        return Objective(replay, space, drives.trials, measured, noise).renewed(at)
 
-    if noise.source == "defaults":
-        noise = objective(start).residual_noise(start)
-    elif noise.gyro is not None:
-        noise = replace(noise, gyro=objective(start).residual_noise(start).gyro)
-    starts = [start] if others is None else [start, *others]
-    fits = [least_squares.fit(objective(one), starts=one[None],
-                              stop=least_squares.Stopping(iterations)) for one in starts]
-    best = min(fits, key=lambda fit: fit.cost)
-    return best.u if best.cost < fits[0].initial_cost else None
+    ends = [to_its_end(objective, one, iterations) for one in ([start] if others is None else [start, *others])]
+    best = int(least_squares.costs_of(objective(ends[0]), np.stack([start, *ends])).argmin())
+    return ends[best - 1] if best else None
+
+
+def to_its_end(objective: Callable[[np.ndarray], Residuals], u: np.ndarray, iterations: int) -> np.ndarray:
+    """Where searches of so many iterations at most end, each begun where the one before ended, until one gains nothing
+    that counts.
+
+    Costs are jagged, so a search ends where its own steps happen to gain nothing, and rounding decides where. The next
+    one has damping and derivatives anew, and what drives do not show of the noise is then what that end leaves.
+
+    Args:
+        objective: around unit coordinates (P,).
+        u: (P,) where the first search begins.
+    """
+    for _ in range(SEARCHES):
+        found = least_squares.fit(objective(u), starts=u[None], stop=least_squares.Stopping(iterations))
+        u = found.u
+        if found.initial_cost - found.cost <= WORTH * found.cost:
+            break
+    return u

@@ -33,6 +33,9 @@ ASSUMED_SPREAD = 0.05
 ASSUMED_DAYS = 4.0
 """How many days of reference drives that assumption counts as."""
 LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
+OWN_ITERATIONS = 30
+"""Of the base fit to the drives of one day, at most: near the fit to all days it ends by itself after a few. Fits to
+blocks of a long run that are cut short would differ by less than they should."""
 WEAK_PRIOR = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known
 BLOCK = "block"
 """Field of a log that is one part of a long run."""
@@ -78,7 +81,7 @@ def make_reference(
             index = np.flatnonzero(day == number)
             one = drives.of(log.training, vehicle.plant.dt)
             one = one.weighted(one.simulate(space.to_values(u)[None])[0], factors, spec.track)
-            own = BaseFit(one, space, whitener, sizes).run(u, 6, prior, progress)
+            own = BaseFit(one, space, whitener, sizes).run(u, OWN_ITERATIONS, prior, progress)
             days[number] = own - u
             bins = one.target.shape[1]
             left[index, :bins] = one.target - one.simulate(space.to_values(own)[None])[0]
@@ -143,7 +146,7 @@ def _own_leftovers(drives: Drives, space: Space, u: np.ndarray, log: Log, progre
     spread = assumed_spread(space, u)
     whitener = first_scales(drives.target, drives.mask, replicate_groups(log.training))
     prior = (u, np.diag(1 / (3 * spread) ** 2))
-    own = BaseFit(drives, space, whitener, difference_sizes(np.diag(spread**2))).run(u, 6, prior, progress)
+    own = BaseFit(drives, space, whitener, difference_sizes(np.diag(spread**2))).run(u, OWN_ITERATIONS, prior, progress)
     at = drives.simulate(space.to_values(own)[None])[0]
     level = roughness(at, drives.features.width, log.spec.track)
     factors = fit_roughness(drives.target - at, drives.mask, level)

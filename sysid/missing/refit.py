@@ -14,8 +14,8 @@ from sysid.missing.days import Reference, difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
 from sysid.missing.joint_fit import Refit, Start
+from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_all_cores
-from sysid.replay.quotients import Quotients
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from whill_mjx.io.steps import step
 
@@ -108,7 +108,9 @@ class Refitter:
         """One fit: yields parameter sets (N, all), is sent their white features (N, B, n).
 
         The coordinates' columns are renewed in every iteration, those of the base parameters only where a step did not
-        bring what they promised: a day moves them by percents, and they are the dearer ones.
+        bring what they promised: a day moves them by percents, and they are the dearer ones. A fit that has come to
+        rest begins again from there, damped as at first and with all columns anew, as long as that promises to gain
+        what counts and the way since the last beginning did: where it rests depends on rounding.
         """
         found, size = start.hypotheses, len(start.u)
         solver = self._solver(found)
@@ -118,6 +120,7 @@ class Refitter:
         fresh, stale = start.slopes is not None or bool(np.allclose(start.u, self.reference.u)), False
         residual = self.target - (yield self._sets(found, state.u))[0]
         state = state._replace(cost=solver.cost(residual, state.u))
+        begun = np.inf
         for iteration in range(iterations + 1):
             slopes = None if stale else jacobian[..., :size]
             jacobian = yield from self._derivatives(found, state.u[0], residual, slopes)
@@ -133,8 +136,13 @@ class Refitter:
             if not fresh:  # a small gain by old derivatives says nothing
                 state = state._replace(calm=np.zeros(1, int))
             if solver.done(state).all() or (state.calm[0] and state.damping[0] > STIFFEST):
-                break
-            if gained > PROMISE * tried.promised[0, best] and gained >= small:
+                anew = state._replace(damping=np.full(1, solver.damping), calm=np.zeros(1, int))
+                promised = solver.tries(anew, *solver.normal(-residual, jacobian[None], state.u)).promised.max()
+                last = not self.renews or iteration >= iterations - 1
+                if last or min(begun - state.cost[0], promised) < small:
+                    break
+                state, begun, fresh, stale = anew, float(state.cost[0]), False, True
+            elif gained > PROMISE * tried.promised[0, best] and gained >= small:
                 fresh = False
             else:
                 stale = self.renews and iteration < iterations - 1

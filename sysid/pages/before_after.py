@@ -30,8 +30,7 @@ class Paths:
     channel: str
     t: np.ndarray  # (T,) s
     measured: np.ndarray  # (T, 3)
-    replays: dict[str, np.ndarray]
-    """Replay -> (T, 3)."""
+    replays: dict[str, np.ndarray]  # replay -> (T, 3)
 
 
 def replayed_paths(trials: Sequence[Trial], replays: Mapping[str, Sequence[Prediction]]) -> list[Paths]:
@@ -69,8 +68,7 @@ def shown_drive(drives: Sequence[Paths]) -> dict[str, Any] | None:
 def drive_pictures(shown: Mapping[str, Any], names: Mapping[str, str]) -> str:
     """Path, position error over time and heading error over time of the drive that is shown.
 
-    Args:
-        names: replay -> what it is called, worst first.
+    `names`: replay -> what it is called, worst first.
     """
     t, measured = np.asarray(shown["t"], float), np.asarray(shown["measured"], float)
     replays = {name: np.asarray(shown[name], float) for name in names}

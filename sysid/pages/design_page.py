@@ -32,8 +32,8 @@ def text(found: Proposal, criterion: Criterion) -> str:
                      f"{y:.2f} m from the corner, heading {np.rad2deg(yaw):.0f} degrees")
     index = int(np.argmax(before))
     after = chosen[-1].deviation
-    lines.append(f"largest uncertainty: {space.names[index]}, {_share(before[index])} of its range; after the drive "
-                 f"{_share(after[index])}")
+    lines.append(f"largest uncertainty: {space.names[index]}, +-{before[index]:.1%} of its range; after the drive "
+                 f"+-{after[index]:.1%}")
     lines.append(f"{'manoeuvre':18} {'sum of variances':>17} {'volume (log)':>13}   ({CRITERIA[criterion]} first)")
     lines += [f"{plan.candidate.name:18} {plan.trace:17.4f} {plan.volume:13.2f}" for plan in plans[:SHOWN]]
     blind = blind_parameters(plans, space)
@@ -116,7 +116,3 @@ def _room_chart(plan: Plan, limits: Limits) -> str:
 def _held(t: np.ndarray, values: np.ndarray) -> Line:
     """A command that holds until the next."""
     return Line(np.repeat(t, 2)[1:], np.repeat(values, 2)[:-1])
-
-
-def _share(deviation: float) -> str:
-    return f"+-{deviation:.1%}"

@@ -40,12 +40,7 @@ SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
 
 
 def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[Section]:
-    """All sections of the report of a fit.
-
-    Args:
-        report: content of report.json (keys in `sysid.report`).
-        series: motion of the trials; without any, the charts are left out.
-    """
+    """All sections of the report of a fit (entries: docs/formats.md); without `series`, the charts are left out."""
     drawn = choose(series)
     sections = [Section("Summary", summary(report, series)), Section("Parameters", parameters(report))]
     if report.get("profiles"):
@@ -349,7 +344,7 @@ def errors(report: dict[str, Any]) -> str:
     channel = "ground_truth" if any(row["channel"] == "ground_truth" for row in position) else "odometry"
     shown = [row for row in position if row["channel"] == channel][:40]
     names = [row["trial"] + ("*" if row["held_out"] else "") for row in shown]
-    items = [bar_chart(names, {replay: [_float(row["metrics"][metric][replay]) for row in shown]
+    items = [bar_chart(names, {replay: np.array([row["metrics"][metric][replay] for row in shown], float).tolist()
                                for replay in REPLAYS}, f"{metric} RMSE [{UNITS[metric]}]",
                        f"{CHANNEL_NAMES[channel]}, {metric}", width=max(420, min(1100, 30 * len(shown) + 120)))
              for metric in ("trajectory", "yaw") if shown]
@@ -428,7 +423,3 @@ def _label(trial: TrialSeries) -> str:
 
 def _is_more(value: float | None, reference: float | None) -> bool:
     return value is not None and reference is not None and value > WORSE * reference
-
-
-def _float(value: float | None) -> float:
-    return float("nan") if value is None else value

@@ -1,8 +1,10 @@
-"""What a fit writes besides its pages: report.json (keys in `sysid.report`), and the origin in its vehicle file."""
+"""What a fit writes besides its pages: report.json (entries: docs/formats.md), the origin in its vehicle file, and
+sentences on the sizes and the tracked point that it found."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,12 @@ import numpy as np
 
 from sysid.errors.prior import moved
 from sysid.intervals import uncertainty
+from sysid.intervals.uncertainty import Estimate
 from sysid.logs import odometry_frames
 from sysid.logs.measured import load_any
 from sysid.logs.metrics import score
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.fit_statistics import statistics_of
-from sysid.pages.calibration import calibration_notes
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
 from sysid.pages.series import collect, save
 from sysid.replay.models import Model, Twin, describe_parameters, get_parameters, save_model
@@ -28,6 +30,7 @@ from sysid.search.result import Progress
 from sysid.search.settings import FitConfig
 from sysid.search.studies import without_secrets
 from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.specs import VehicleSpec
 
 
 @dataclass(frozen=True)
@@ -36,12 +39,11 @@ class Loaded:
 
     log: Log
     path: str | Path
-    source: dict[str, Any] = field(default_factory=dict)
-    """More to note beside it."""
+    source: dict[str, Any] = field(default_factory=dict)  # more to note beside it
 
 
 def make_report(data: Loaded, config: FitConfig, fit: Fit, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The report of a fit (keys in `sysid.report`)."""
+    """The report of a fit (entries: docs/formats.md)."""
     log = data.log
     about = describe_parameters(fit.params)
     parameters = [
@@ -106,7 +108,7 @@ def fit_dataset(
     path: str | Path | Loaded, out: str | Path, quick: bool = False, config: FitConfig | None = None,
     progress: Progress | None = None, model: Model | None = None,
 ) -> dict[str, Any]:
-    """Fit a dataset and write report.json, report.html, plots and vehicle.toml into the folder `out`.
+    """Fit a dataset and write report.json (returned), report.html, plots and vehicle.toml into the folder `out`.
 
     Of another model than the simulator's vehicle, model.toml is written, model.xml where it came from an MJCF or URDF
     file, and vehicle.toml where a vehicle of the simulator drives alike.
@@ -115,9 +117,6 @@ def fit_dataset(
         path: dataset folder, or a log that was read before.
         quick: overrides `config.quick` where true.
         model: as of `fit_log`.
-
-    Returns:
-        The report.
     """
     from sysid.pages.plots import write_plots
     from whill_mjx.vehicle.vehicle_file import save_vehicle
@@ -199,3 +198,87 @@ def _distance(trial: Trial, replay: Prediction) -> float:
     """Position error against the outside pose, or else against the odometry [m]."""
     found = score(trial, replay)
     return float(found["ground_truth" if trial.ground_truth is not None else "odometry"].trajectory or 0.0)
+
+
+LEAST = 5e-4  # share of a size, or of a scale, that counts as nothing
+SIZES = {
+    "wheel radius": ("wheel_radius_difference.common", "wheels.radius"),
+    "track": ("track_width.error", "wheels.track"),
+}
+UNKNOWN = ("Without an outside pose this log does not separate errors of wheel radius, track and odometry's scale "
+           "from one another: they are taken as stated, and the odometry's path has their error.")
+
+
+def calibration_notes(
+    estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial], kept: Sequence[str] = ()
+) -> list[str]:
+    """Sentences on radius, track, the odometry's scales and the tracked point; those that a log leaves open are
+    named.
+
+    `kept`: groups that keep their stated values (`sysid.search.stated`).
+    """
+    notes = _notes(estimates, spec, trials)
+    if kept:
+        notes.append(f"Stated values are kept for {', '.join(kept)}: free ones did not predict held-back drives "
+                     "better.")
+    return notes
+
+
+def _notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial]) -> list[str]:
+    found = {one.name: one for one in estimates}
+    if not any(trial.ground_truth is not None for trial in trials):
+        return [UNKNOWN]
+    if not any(name in found for names in SIZES.values() for name in names) and "pose_mount.x" not in found:
+        return []
+    stated = {"wheel radius": spec.wheel_radius, "track": spec.track}
+    notes, open_ones = [], []
+    for what, names in SIZES.items():
+        one = next((found[name] for name in names if name in found), None)
+        if one is None:
+            continue
+        if not one.identifiable:
+            open_ones.append(what)
+            continue
+        relative = one.name == names[0]  # otherwise in metres
+        value, low, high = (1 + x if relative else x / stated[what] for x in (one.value, one.low, one.high))
+        notes.append(_size(what, stated[what], value, low, high))
+    for what, name in (("distance", "odometry_scale.linear"), ("yaw", "odometry_scale.angular")):
+        one = found.get(name)
+        if one is not None and one.identifiable and abs(one.value - 1) > LEAST and not one.low <= 1 <= one.high:
+            notes.append(f"The odometry reports {one.value:.4f} times the {what} of wheels of the stated sizes "
+                         f"({one.low:.4f} to {one.high:.4f}): it takes other sizes than the controller.")
+    if "pose_mount.x" in found:
+        x, y, yaw = (found[f"pose_mount.{axis}"] for axis in ("x", "y", "yaw"))
+        at_zero = [one for one in (x, y, yaw) if one.identifiable and one.low <= 0 <= one.high]
+        if len(at_zero) == 3:
+            near = 1000 * max(-x.low, x.high, -y.low, y.high)
+            angle = math.degrees(max(-yaw.low, yaw.high))
+            return [*notes, f"The outside pose follows the reference point, within {near:.1f} mm and {angle:.2f} "
+                            "degrees."]
+        sides = [f"{abs(one.value):.4f} m {names[one.value < 0]} ({_range(one, 4)})"
+                 for one, names in ((x, ("ahead of", "behind")), (y, ("left of", "right of")))
+                 if one.identifiable]
+        if sides:
+            notes.append(f"The tracked point lies {' and '.join(sides)} the reference point.")
+        if yaw.identifiable:
+            notes.append(f"Its heading is turned by {abs(math.degrees(yaw.value)):.2f} degrees to the "
+                         f"{'left' if yaw.value >= 0 else 'right'} of the vehicle's "
+                         f"({_range(yaw, 2, math.degrees)} degrees).")
+        open_ones += [f"the tracked point's {axis}" for axis, one in (("x", x), ("y", y), ("heading", yaw))
+                      if not one.identifiable]
+    if open_ones:
+        notes.append(f"This log does not determine {', '.join(open_ones)}: drive turns on the spot and straight lines.")
+    return notes
+
+
+def _size(what: str, stated: float, value: float, low: float, high: float) -> str:
+    interval = f"{stated * low:.4g} to {stated * high:.4g} m"
+    if abs(value - 1) < LEAST or low <= 1 <= high:
+        return f"The {what} is as stated, {stated:.4g} m ({interval})."
+    side = "larger" if value > 1 else "smaller"
+    return (f"The {what} is {stated * value:.4g} m ({interval}), {abs(value - 1):.1%} {side} than the stated "
+            f"{stated:.4g} m.")
+
+
+def _range(one: Estimate, digits: int, unit: Callable[[float], float] = float) -> str:
+    return f"{unit(one.low):.{digits}f} to {unit(one.high):.{digits}f}"

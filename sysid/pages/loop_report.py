@@ -1,63 +1,4 @@
-"""The report of a closed loop: `report.json` (versioned, below), the page, the vehicle file with the effect in it.
-
-    schema, kind      1, "sysid-close-loop"
-    verdict, reason   "named", "none" or "unexplained", and why in one sentence
-    noise             channel -> factor on the noise of the reference days, its 95 % interval, and whether it surely
-                      `changed`; empty without reference days
-    noise_sentence    the channels that changed, null where none did
-    warnings          what speaks against taking a name as certain, in sentences
-    advice            of these, what changes what a reader should do, with a remedy
-    known             whether there is a reference: drives of other days, or a vehicle file
-    question          what was asked: against a reference, or of the model family
-    effects           name, kind ("effect" or "parameter_shift"), class, parameters {name: value, interval, open, unit,
-                      `was` in the vehicle as it was, `neutral`, description}, p_value, equation, evidence; an interval
-                      lies within the physical range, and drives that allow values beyond an end of it leave that end
-                      `open`
-    before            training, held_out -> channel -> trajectory, yaw, velocity, angular_velocity (mean RMSE), and
-                      noise_floor of the same where there are replicates: of the same manoeuvres, held out or not. It is
-                      that of the vehicle as it was: none of its parameters has moved
-    refitted, after   the same, refitted to these drives within its day-to-day spread without, and with what was found
-    alone             the same, of the vehicle of `refitted` with only the named effects' own parameters fitted; null
-                      unless named
-    shown             one drive as measured and in these three replays (keys: `sysid.pages.before_after.shown_drive`)
-    change            training, held_out -> channel -> metric -> mean change of the RMSE with its 95 % interval from
-                      resampled trials, and how many trials got worse
-    by_manoeuvre      rows of the same for each manoeuvre, with intervals from resampled trials and blocks of them
-                      (`sysid.follow_up.changes`)
-    worse             rows of the same from `refitted` to `after` whose error surely grew
-    missing           p-value of "nothing is missing", against reference days calibrated
-    (`sysid.follow_up.calibrated`), and
-                      `p_search` as the search has it; that of the scan of pairs; squared residual in excess of the
-                      noise, as a share of it, before and after; share `explained` of what could be predicted; of
-                      simulated days that were refitted (`--refit-nulls`, else null) count, calibrated p-value, false
-                      alarms and the upper 95 % bound of their rate
-    forms             per named effect curves over speed, yaw rate and time of how much larger than by its law it is:
-                      `share` of its size `at` values of the quantity, with a 95 % band (`low`, `high`)
-    decision          how the verdict was reached, as the picture of the page shows it; null for drives that stand alone
-    weights           posterior weights of `none` or `noise`, of sets of effects (" + " between them), of `unknown`
-    steps             the sets of effects that were weighed: gain, gain of each effect beside other forms of the others
-                      (`own`) and its p-value, what is left that replicates have in common, smooth functions predict, or
-                      may be at random, and the share explained (`sysid.verdict.posterior.Findings`)
-    operating         of these very drives: `alpha` of each decision, how many there are (`decisions`); `false_alarms`
-                      of the scan on simulated days (count, alarms, rate, upper 95 % bound); `power`: per named effect
-                      the share of simulated days on which it would be noticed, at factors on its size
-    log_doubts        what is wrong with the log itself, in sentences
-    contradicted      what speaks against an effect that would else have been named, in sentences
-    pairs             of the scan: the pairs of effects that explain most together
-    candidates        per round the refitted effects: gain, share of the residual explained, coordinates
-    detectable        per effect the smallest size that these drives would show with 80 % power, and how often it was
-                      noticed on simulated days (`power`)
-    lives_in          where the unexplained residual lives
-    unnamed           the wrench over one quantity that best predicts it (keys: `sysid.follow_up.unnamed.as_report`);
-    where
-                      it is `kept`, "after" and vehicle.toml have it; null unless something is unexplained
-    next_manoeuvre    the drive that would separate the effects of a class, written to next_command.csv; null where
-                      there is nothing to separate (keys: `sysid.follow_up.next_manoeuvre.next_manoeuvre`)
-    base              base parameters: reference value, day-to-day spread, value on these drives in the search (`value`)
-                      and after the last refits without and with what was named (`before`, `after`), and how many
-                      spreads that with it is `away`
-    manifest          everything fixed beforehand, and its SHA-256
-"""
+"""What a closed loop writes: `report.json` (entries: docs/formats.md), the page, the vehicle file with the effect."""
 
 from __future__ import annotations
 
@@ -72,20 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from sysid.errors.noise_level import said
-from sysid.follow_up.calibrated import calibrated
+from sysid.errors.noise import said
+from sysid.follow_up import trust
 from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
-from sysid.follow_up.power import DRAWS, POWER, SEED, Days, false_alarms, power_curve, smallest
-from sysid.follow_up.trust import (
-    CONFIDENCE,
-    advice,
-    as_good_as_repeats,
-    beside_still_base,
-    contradicted,
-    intervals,
-    warnings,
-)
+from sysid.follow_up.power import DRAWS, POWER, SEED, Days, calibrated, false_alarms, power_curve, smallest
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
 from sysid.logs.coverage import doubts
 from sysid.logs.metrics import METRICS, own_floor
@@ -141,8 +73,8 @@ def make_report(result: Result) -> dict[str, Any]:
     return {
         "schema": SCHEMA, "kind": KIND, "verdict": found.verdict, "reason": found.reason,
         "noise": noise, "noise_sentence": said(noise, same) or None,
-        "warnings": warnings(result),
-        "advice": advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
+        "warnings": trust.warnings(result),
+        "advice": trust.advice(result, predicts_well(trials, rows)), "known": result.reference.known, "question": asked,
         "remark": result.reference.remark,
         "dataset": {"name": result.log.name, "sha256": result.log.sha256, "vehicle": result.log.spec.name,
                     "training": [t.name for t in result.log.training],
@@ -155,7 +87,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "alone": alone(result, trials, before), "change": change(rows),
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
-        "log_doubts": doubts(result.log), "contradicted": contradicted(result), "pairs": pairs_of(result),
+        "log_doubts": doubts(result.log), "contradicted": trust.contradicted(result), "pairs": pairs_of(result),
         "missing": missing(result),
         "weights": found.weights, "steps": steps(result),
         "forms": form_curves(result), "decision": (
@@ -195,7 +127,7 @@ def predicts_well(trials: tuple[Trial, ...], rows: list[dict[str, Any]]) -> bool
     mine = [row for row in rows if row["held_out"] is held and "trajectory" in row["metrics"]]
     channel = "ground_truth" if any(row["channel"] == "ground_truth" for row in mine) else "odometry"
     errors = np.array([row["metrics"]["trajectory"]["fitted"] for row in mine if row["channel"] == channel])
-    return as_good_as_repeats(errors, (own_floor(trials, held).get(channel) or {}).get("trajectory"))
+    return trust.as_good_as_repeats(errors, (own_floor(trials, held).get(channel) or {}).get("trajectory"))
 
 
 def alone(result: Result, trials: tuple[Trial, ...], before: list[Prediction]) -> dict[str, Any] | None:
@@ -299,12 +231,9 @@ def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
 
 
 def effects(result: Result) -> list[dict[str, Any]]:
-    """The named effects with values, intervals and evidence.
-
-    Values are those of the joint refit that decided; the vehicle file has them after the last refit to whole poses.
-    """
+    """The named effects with values (of the joint refit that decided), intervals and evidence."""
     final, found = result.search.final, result.search
-    ends_of = np.stack([intervals(one, result) for one in (final, *beside_still_base(result))])
+    ends_of = np.stack([trust.intervals(one, result) for one in (final, *trust.beside_still_base(result))])
     low, high = ends_of[:, 0].min(0), ends_of[:, 1].max(0)
     values = dict(zip(result.names, final.values.tolist(), strict=True))
     base, was = base_values(result.full), base_values(result.reference.params)
@@ -323,18 +252,19 @@ def effects(result: Result) -> list[dict[str, Any]]:
                 "parameters": {axis.parameter: {
                     "value": values[axis.parameter],
                     **in_range(axis.parameter, values[axis.parameter], [end[axis.parameter] for end in ends]),
-                    "confidence": CONFIDENCE, "unit": unit_of(axis.parameter), "was": was.get(axis.parameter),
-                    "neutral": about_of(axis.parameter).neutral,
+                    "confidence": trust.CONFIDENCE, "unit": about_of(axis.parameter).unit,
+                    "was": was.get(axis.parameter), "neutral": about_of(axis.parameter).neutral,
                     "description": about_of(axis.parameter).description} for axis in one.axes},
-                "p_value": found.accepted[index].p, "equation": equation_of(one),
+                "p_value": found.accepted[index].p,
+                "equation": equation(EFFECTS[one.effect]) if one.effect in EFFECTS else "",
                 "evidence": evidence_for(result, slice(start, stop), one.effect)})
         start = stop
     return out
 
 
 def in_range(parameter: str, value: float, ends: Sequence[float]) -> dict[str, Any]:
-    """An interval within the range that is physical for a parameter, and which of its ends the drives leave `open`:
-    they would allow values beyond that range as well. A value beyond it has an interval of its own."""
+    """An interval within a parameter's physical range, and which of its ends the drives leave `open`, as they allow
+    values beyond that range. A value beyond it has an interval of its own."""
     about = about_of(parameter)
     known = [one for one in (about.low, about.high, about.neutral, value) if np.isfinite(one)]
     low, high = sorted(ends)
@@ -349,19 +279,8 @@ def about_of(parameter: str) -> Parameter:
     return parameters_of(EFFECTS[effect])[name]
 
 
-def unit_of(parameter: str) -> str:
-    """Unit of a dotted parameter name."""
-    return about_of(parameter).unit
-
-
-def equation_of(one: Hypothesis) -> str:
-    """The equation of the effect."""
-    return equation(EFFECTS[one.effect]) if one.effect in EFFECTS else ""
-
-
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
-    """What each manoeuvre says of an effect by itself, whether it predicts manoeuvres that were left out, and its
-    falsifiers."""
+    """What manoeuvres say of an effect by themselves, whether it predicts those left out, and its falsifiers."""
     one = next((one for one in result.stood if one.effect == effect), None)
     final, groups, precision = result.search.final, result.evidence.groups, result.evidence.precision
     sizes, errors = (one.sizes, one.errors) if one else sizes_apart(final, part, groups, precision)
@@ -379,8 +298,7 @@ def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
 
 
 def form_curves(result: Result) -> dict[str, list[dict[str, Any]]]:
-    """Effect -> curves of how far it is off its law (`sysid.verdict.forms.Deviation`). What its forms leave counts as
-    noise."""
+    """Effect -> curves of how far it is off its law (`forms.Deviation`). What its forms leave counts as noise."""
     found, form = result.search, result.config.thresholds.form
     if found.verdict != "named" or found.findings is None:
         return {}
@@ -421,7 +339,7 @@ def detectable(result: Result, days: Days) -> list[dict[str, Any]]:
         value, reach = one.values(factor * q, base)[axis.parameter], factor * q.max() <= axis.limit and power >= POWER
         out.append({"effect": one.effect, "parameter": axis.parameter, "value": value if reach else None,
                     "change": value - base[axis.parameter] if np.isfinite(base[axis.parameter]) and reach else None,
-                    "unit": unit_of(axis.parameter), "power": power})
+                    "unit": about_of(axis.parameter).unit, "power": power})
     return out
 
 
@@ -481,8 +399,7 @@ def wrapped(line: str, width: int) -> str:
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, both pages, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
-    from sysid.pages.loop_page import write_page
-    from sysid.pages.method_page import write_method
+    from sysid.pages.loop_page import write_method, write_page
     from sysid.pages.report import write_report
     from sysid.verdict.posterior import write as write_evidence
     from whill_mjx.vehicle.vehicle_file import save_vehicle

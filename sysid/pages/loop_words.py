@@ -22,7 +22,7 @@ def title(report: Mapping[str, Any]) -> str:
             "Nothing is missing that these drives show")
     if report["verdict"] == "unexplained":
         return "; ".join(["Something is missing that no known effect explains", *(f"changed: {one}" for one in floor)])
-    changed = [one for one in report["effects"] if is_change(one)]
+    changed = [one for one in report["effects"] if any(map(_differs, one["parameters"].values()))]
     missing = [sized(one) for one in report["effects"] if one not in changed]
     parts = [("Missing", missing), ("Changed", [*map(sized, changed), *floor])]
     return "; ".join(f"{what}: {'; '.join(those)}" for what, those in parts if those)
@@ -72,11 +72,6 @@ def size(one: Mapping[str, Any]) -> str:
     return text if was is None or not _differs(one) else f"{text}, before {factor * was:.{digits}f}"
 
 
-def is_change(effect: Mapping[str, Any]) -> bool:
-    """Whether the vehicle had the effect before, in another size."""
-    return any(_differs(one) for one in effect["parameters"].values())
-
-
 def spoken(name: str) -> str:
     """A name of the catalogue as one says it."""
     return name.replace("_", " ")
@@ -94,7 +89,8 @@ def prediction(report: Mapping[str, Any]) -> str:
     which = "On drives that no fit has seen" if part == "held_out" else "On the drives that were fitted"
     where = "" if channel == "ground_truth" else " of the odometry"
     names = vehicles(report)
-    text = ", ".join(f"{100 * numbers[key]:.1f} cm {_article(names[key])}" for key in names)
+    text = ", ".join(f"{100 * numbers[key]:.1f} cm {'for ' * name.startswith('the ')}{name}"
+                     for key, name in names.items())
     repeats = "" if floor is None else f"; two repeats of one drive differ by {100 * floor:.1f} cm"
     return f"{which}, the predicted position{where} is off by {text}{repeats}."
 
@@ -231,7 +227,3 @@ def _differs(one: Mapping[str, Any]) -> bool:
 def _digits(low: float, high: float) -> int:
     width = abs(high - low)
     return min(max(1 - math.floor(math.log10(width)), 0), 6) if width > 0 else 3
-
-
-def _article(name: str) -> str:
-    return f"for {name}" if name.startswith("the ") else name

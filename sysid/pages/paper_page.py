@@ -50,13 +50,9 @@ class PaperConfig:
 
 
 def compare(rows: Sequence[dict[str, Any]], channel: str) -> list[dict[str, Any]]:
-    """Errors of one channel by manoeuvre and metric over replicate drives, with tests.
+    """Errors of one channel by manoeuvre and metric over replicate drives, with tests, from `error_rows`.
 
-    Args:
-        rows: from `sysid.pages.report.error_rows`.
-
-    Returns:
-        One entry per manoeuvre and metric: drives, initial and optimised (mean, SD), p, p_holm (None with one drive).
+    One entry each: drives, initial and optimised (mean, SD), p, p_holm (None with one drive).
     """
     found: list[dict[str, Any]] = []
     for manoeuvre in PAPER_MANOEUVRES:

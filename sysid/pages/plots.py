@@ -68,12 +68,7 @@ def write_plots(
 def write_paper_figures(
     folder: Path, series: Sequence[TrialSeries], trajectories: Sequence[str], yaws: Sequence[str]
 ) -> list[Path]:
-    """Write the paper's two figures, paper_trajectories.png and paper_yaw.png: one panel per manoeuvre, first drive.
-
-    Args:
-        series: measured and replayed motion (`sysid.pages.series`).
-        trajectories, yaws: manoeuvres shown in each.
-    """
+    """Write paper_trajectories.png and paper_yaw.png of such manoeuvres: one panel each, of its first drive."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -95,12 +95,9 @@ def read_report(run: Path) -> dict[str, Any]:
 
 
 def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections: Sequence[Section] = ()) -> Path:
-    """Write RUN/report.html from RUN/report.json, self-contained.
+    """Write RUN/report.html from RUN/report.json, self-contained, with more `sections` first.
 
-    Args:
-        run: folder of a fit.
-        series: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
-        sections: more sections, shown first.
+    `series`: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
     """
     from sysid.pages.fit_page import fit_sections, headline
     from sysid.pages.series import FILE, load, replay

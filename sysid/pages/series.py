@@ -30,8 +30,7 @@ class Channel:
     """One channel of one trial."""
 
     t: np.ndarray  # (T,) s
-    values: dict[str, np.ndarray]
-    """"measured", "ideal", "initial", "fitted" -> (T, 3) or (T, 5)."""
+    values: dict[str, np.ndarray]  # "measured", "ideal", "initial", "fitted" -> (T, 3) or (T, 5)
 
     def error(self, replay: str = "fitted") -> np.ndarray:
         """Replayed minus measured (T, C); position along and left of the measured heading, yaw as an angle."""
@@ -50,8 +49,7 @@ class TrialSeries:
 
     name: str
     held_out: bool
-    start: tuple[float, float, float]
-    """x, y [m], yaw [rad] in the room."""
+    start: tuple[float, float, float]  # x, y [m], yaw [rad] in the room
     channels: dict[str, Channel]
 
 
@@ -123,8 +121,7 @@ def _trial_series(path: Path, arrays: dict[str, np.ndarray], index: str, about: 
 def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
     """Series of a run folder without the file: load its dataset and replay the vehicle before and after the fit.
 
-    Raises:
-        FileNotFoundError, ValueError: the dataset has moved or changed since the fit.
+    FileNotFoundError or ValueError where the dataset has moved or changed since the fit.
     """
     import jax
     import jax.numpy as jnp

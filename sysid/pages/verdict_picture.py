@@ -10,10 +10,8 @@ from typing import Any
 from sysid.pages.loop_words import spoken
 from sysid.verdict.posterior import MOST, Findings, Posterior, Thresholds, posterior
 
-SHOWN = 6
-"""Sets of effects in the picture: those that gain most."""
-LEAST = 1e-12
-"""p-value at the end of the axis."""
+SHOWN = 6  # sets of effects in the picture: those that gain most
+LEAST = 1e-12  # p-value at the end of the axis
 WIDTH, ROW, LEFT, MIDDLE, RIGHT, WORDS = 830, 21, 280, 460, 600, 614
 """Size [px] of the picture and a row; where shares begin, where weights begin and end, and where remarks begin."""
 BLUE, GREY, RED = "#1f6fb4", "#b4b4b4", "#b2182b"
@@ -57,10 +55,10 @@ def _outcome(findings: Findings, priors: Thresholds, judged: Posterior, number: 
         return "contradicted"
     if len(one.effects) > MOST:
         return "tried to check the others"
-    if max(one.p) >= priors.alpha:
-        return "may be another form of the other" if len(one.effects) > 1 else "may be chance"
     if not findings.able(one, priors):
-        return "is wrong about other manoeuvres" if min(one.foretold) <= 0 < len(one.effects) - 1 else "adds too little"
+        if len(one.effects) == 1:
+            return "adds too little"
+        return "is wrong about other manoeuvres" if min(one.foretold) <= 0 else "may be another form of the other"
     if judged.verdict == "none":
         return "no more than days differ by"
     if number != judged.chosen:

@@ -1,9 +1,12 @@
-"""What lets one text serve NumPy's arrays and, under a trace, those of JAX."""
+"""NumPy or, under a trace, JAX for an array; and points by whose differences slopes are found."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 
@@ -18,3 +21,54 @@ def added(array: Any, index: Any, part: Any) -> Any:
         array[index] += part
         return array
     return array.at[index].add(part)
+
+
+@dataclass(frozen=True)
+class Quotients:
+    """Pairs of points (..., P, P) that differ in one of P coordinates each, of NumPy or, under a trace, of JAX.
+
+    df/dx_p = (f(above_p) - f(below_p)) / (above_pp - below_pp)
+    """
+
+    above: Any
+    below: Any
+
+    @classmethod
+    def central(cls, x: Any, sizes: Any, low: float = 0.0, high: float = 1.0) -> Quotients:
+        """About x (..., P), `sizes` (P,) to both sides; one-sided at the bounds `low` and `high`."""
+        xp = namespace(x)
+        steps = sizes * xp.eye(x.shape[-1])
+        above, below = (xp.clip(x[..., None, :] + sign * steps, low, high) for sign in (1, -1))
+        return cls(above, below)
+
+    @classmethod
+    def forward(cls, x: np.ndarray, sizes: np.ndarray) -> Quotients:
+        """From x (P,), where f is known already, `sizes` (P,) upwards."""
+        return cls(x + np.diag(sizes), np.broadcast_to(x, (len(x), len(x))))
+
+    def mapped(self, coordinates: Callable[[Any], Any]) -> Quotients:
+        """The same points in other coordinates, by which the slopes then are."""
+        return Quotients(coordinates(self.above), coordinates(self.below))
+
+    def along(self, at: np.ndarray, simulate: Callable[[np.ndarray], Any]) -> tuple[Any, Any]:
+        """What `simulate` gives at points (N, P), and its derivatives (N, ..., P) about them, by one call of it."""
+        count, size = at.shape
+        found = simulate(np.concatenate([at, self.above.reshape(-1, size), self.below.reshape(-1, size)]))
+
+        def slope(leaf: Any) -> np.ndarray:
+            above, below = np.asarray(leaf, float)[count:].reshape(2, count, size, *leaf.shape[1:])
+            return np.asarray(self.slopes(above, below))
+
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found), jax.tree.map(slope, found)
+
+    @property
+    def points(self) -> Any:
+        """(..., 2 P, P) all points, those above first."""
+        return namespace(self.above).concatenate([self.above, self.below], axis=-2)
+
+    def slopes(self, above: Any, below: Any) -> Any:
+        """Derivatives (..., K, P) from values (..., P, K) at both sides; K may be any axes."""
+        xp = namespace(above)
+        spans = xp.diagonal(self.above - self.below, axis1=-2, axis2=-1)  # (..., P)
+        more = above.ndim - spans.ndim
+        return xp.moveaxis((above - below) / spans.reshape(*spans.shape, *(1,) * more), spans.ndim - 1, -1)

@@ -15,17 +15,12 @@ _Done = TypeVar("_Done")
 
 
 def on_processor() -> bool:
-    """Whether replays run on the host's own cores, each call keeping one busy; an accelerator takes one call after the
-    other, and as long for a few rows as for thousands."""
+    """Whether replays run on the host's own cores; an accelerator takes as long for a few rows as for thousands."""
     return jax.default_backend() == "cpu"
 
 
 def on_all_cores(work: Callable[[_Part], _Done], parts: Sequence[_Part], compiled: bool = True) -> list[_Done]:
-    """What `work` gives for each of `parts`, in their order; as many run side by side as the host has cores.
-
-    Args:
-        compiled: otherwise the first goes ahead alone and compiles what the others use.
-    """
+    """What `work` gives for each of `parts`, side by side on all cores; unless `compiled`, the first goes ahead."""
     workers = min(cores(), len(parts))
     if workers < 2:
         return [work(part) for part in parts]

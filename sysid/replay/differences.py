@@ -1,28 +1,160 @@
 """Derivatives of a replay by differences over a share of each parameter's range.
 
-Skidding wheels, torque limits and sampled delays make a motion rough in its parameters: the mean slope over a share of
-the range shows where the motion goes, the derivative at one point need not. Forward mode through a contact solver,
-which stops after a few iterations and switches between sticking and sliding, means nothing at all. A search by
-differences ends at about the costs of one by forward mode in a fraction of the time: replays of many sets fill a
-processor's vectors, tangents do not.
+Skidding wheels, torque limits and sampled delays make a motion rough: the mean slope shows where it goes, the
+derivative at one point need not. Forward mode through a contact solver, which switches between sticking and sliding,
+means nothing. Searches by differences end at about the same costs in a fraction of the time: replays of many sets fill
+vectors, tangents do not.
+
+Where a vehicle starts and which way it faces does not matter to its motion in its own frame, unless an effect is tied
+to the room. Trials with the same commands and start speeds are therefore one course: it is replayed from the origin,
+with its derivatives, then moved to the start of each trial and read at that trial's own times.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.pose_objective import Replays
 from sysid.errors.space import STEP, Space
 from sysid.logs.records import Trial
-from sysid.replay.courses import CourseReplay, make_courses
+from sysid.replay import pieces
+from sysid.replay.arrays import Quotients, namespace
+from sysid.replay.cores import on_processor
 from sysid.replay.models import Parameters, set_parameters
-from sysid.replay.quotients import Quotients
-from sysid.replay.records import Measured, Plant, Simulated
+from sysid.replay.on_host import HostReplay
+from sysid.replay.records import ODOMETRY, POSE, TURN, Measured, Plant, Simulated
+from sysid.replay.rollout import PathReplay, Replay, make_batch
+
+VECTOR, FEW, MANY = 8, 32, 128
+"""Drives that a core replays together fill its vectors, of so many numbers (20 take longer than 24), and are about so
+many for a few parameter sets, and for many: 1.7 ms a drive of 22 s with 32, 1.3 ms with 112, and no less with more."""
+SETS = 4  # parameter sets together at least where courses alone fill vectors: as many as a search tries at once
+
+
+class CourseReplay:
+    """`sysid.replay.rollout.Replay` of trials, with as many drives as there are courses; `courses` is their number."""
+
+    def __init__(self, plant: Plant, trials: tuple[Trial, ...], set_values: Callable[[jax.Array], Any],
+                 anywhere: bool = True, paths: PathReplay | None = None):
+        """`set_values` turns values (P,) into the vehicle's parameters. Unless the motion is the same `anywhere` in the
+        room, every trial is a course. `paths`: compiled programs of the same plant and `set_values`."""
+        batch, self.measured = make_batch(trials, plant.dt)
+        command, start = np.asarray(batch.command), np.asarray(batch.start, float)
+        self._anywhere, self._record = anywhere, plant.dt * command.shape[2]
+        seen: dict[bytes, int] = {}
+        keys = [command[i].tobytes() + start[i, 3 if anywhere else 0 :].tobytes() for i in range(len(trials))]
+        self._course = np.array([seen.setdefault(key, len(seen)) for key in keys])  # (B,)
+        first = np.array([keys.index(key) for key in seen])
+        self.courses = len(first)
+        # Poses are moved from the start of the course to that of the trial.
+        from_start = start[first] * ([0, 0, 0, 1, 1] if anywhere else [1, 1, 1, 1, 1])
+        self._from, self._to = from_start[self._course, :3], start[:, :3]
+        records = command.shape[1]
+        every = np.tile(np.minimum(np.arange(records + 1), records - 1), (self.courses, 1))
+        last = np.tile((np.arange(records + 1) == records).astype(float), (self.courses, 1))
+        float_type = jnp.result_type(float)
+        whole = replace(batch, command=batch.command[first], start=jnp.asarray(from_start, float_type),
+                        pose_index=jnp.asarray(every), pose_weight=jnp.asarray(last, float_type),
+                        odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
+        if batch.gyro_index is not None:
+            whole = replace(whole, gyro_index=jnp.asarray(every), gyro_weight=jnp.asarray(last, float_type))
+        self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
+                       "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
+        if batch.gyro_index is not None:
+            self._times["gyro"] = np.asarray(batch.gyro_index), np.asarray(batch.gyro_weight, float)
+        kind = HostReplay if plant.host is not None and on_processor() else Replay
+        self._replay = kind(plant, whole, set_values)
+        self.paths = paths or PathReplay(plant, set_values, rows_of_call(self.courses))
+        self._traced, self.drives, self.states = self._replay, self.courses, self.courses * records
+        self._trials = [trials[i] for i in first]
+
+    @cached_property
+    def in_pieces(self) -> CourseReplay:
+        """The same with drives in pieces side by side, if they are long, start at rest and may be anywhere."""
+        batch = self._replay.batch
+        records, step = batch.command.shape[1], self._record
+        count = pieces.count(records * step)
+        if count < 2 or batch.warm_up or not self._anywhere or isinstance(self._replay, HostReplay):
+            return self
+        times = pieces.begins(records, count) * step - pieces.OVERLAP
+        speeds = np.stack([pieces.speeds_at(trial, times) for trial in self._trials])
+        other = copy(self)
+        other._traced = self._replay.on(replace(batch, speeds=jnp.asarray(speeds, jnp.result_type(float))))
+        other.drives = count * self.courses
+        return other
+
+    def simulate(self, values: np.ndarray) -> Simulated:
+        """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
+        if isinstance(self._replay, HostReplay):
+            return self._spread(self._replay.simulate(values), motion=True)
+        if not on_processor():
+            size = max(len(values), 2 * values.shape[1] + 1)  # a single one and a Jacobian's are compiled together
+            return self._spread(self._replay.simulate(values, size), motion=True)
+        sets, courses = len(values), self.courses
+        paths = self.paths(np.repeat(values, courses, axis=0), self._replay.batch, np.tile(np.arange(courses), sets))
+        paths = paths.reshape(sets, courses, *paths.shape[1:])
+        turned = paths[..., TURN] if self._replay.batch.gyro_index is not None else None
+        path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)  # type: ignore[arg-type]
+        return self._spread(path, motion=True)
+
+    def traced(self, values: jax.Array) -> Simulated:
+        """As `simulate`, within a compiled function."""
+        return self._spread(self._traced.traced(values), motion=True)
+
+    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
+        """Replay and derivatives (a last axis P) for each of values (N, P)."""
+        rows = 1 if on_processor() else len(values)
+        parts = []
+        for i in range(0, len(values), rows):
+            at, slope = self._replay.jacobian(values[i : i + rows])
+            parts.append((self._spread(at, motion=True), self._spread(slope, motion=False)))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    def _spread(self, simulated: Simulated, motion: bool) -> Simulated:
+        """Courses (N, U, R + 1, ...) at the trials' times (N, B, M, ...); derivatives are turned but not moved."""
+        xp = namespace(simulated.pose)
+        pose, odometry, *gyro = (self._at(name, xp.asarray(getattr(simulated, name))) for name in self._times)
+        diverged: Any = simulated.diverged[:, self._course]
+        extra = (1,) * (pose.ndim - 4)
+        turn = (self._to[:, 2] - self._from[:, 2]).reshape(-1, 1, *extra)  # (B, 1)
+        x, y, yaw = (pose[:, :, :, c] for c in range(3))
+        if motion:
+            x, y, yaw = x - self._from[:, :1], y - self._from[:, 1:2], yaw + turn
+        cos, sin = np.cos(turn), np.sin(turn)
+        x, y = cos * x - sin * y, sin * x + cos * y
+        if motion:
+            x, y = x + self._to[:, :1], y + self._to[:, 1:2]
+        moved: Any = xp.stack([x, y, yaw], axis=3)
+        return Simulated(moved, odometry, diverged, *gyro)
+
+    def _at(self, name: str, values: Any) -> Any:
+        """Values (N, U, R + 1, C, ...) of courses at the trials' times (N, B, M, C, ...)."""
+        xp, (index, weight) = namespace(values), self._times[name]
+        flat = values.reshape(len(values), -1, *values.shape[3:])
+        rows = self._course[:, None] * values.shape[2] + index
+        before, after = (xp.take(flat, one, axis=1) for one in (rows, rows + 1))  # ten times as fast as by two indices
+        return before + weight.reshape(*weight.shape, *(1,) * (values.ndim - 3)) * (after - before)
+
+
+def rows_of_call(courses: int) -> int:
+    """Drives that a core replays at once: one number, since each is compiled; a multiple of `VECTOR`."""
+    return VECTOR * -(-min(max(SETS * courses, FEW), MANY) // VECTOR)
+
+
+def make_courses(plant: Plant, trials: tuple[Trial, ...], set_values: Callable[[jax.Array], Any],
+                 params: Any, paths: PathReplay | None = None) -> tuple[CourseReplay, Measured]:
+    """Replay of trials of a vehicle with `params`, and what was measured; `paths` as of `CourseReplay`."""
+    tied = any(getattr(effect, "room_fixed", True) for effect in params.effects)
+    replay = CourseReplay(plant, trials, set_values, not tied, paths)
+    return replay, replay.measured
 
 
 @dataclass(frozen=True)
@@ -72,8 +204,7 @@ def make_replay(
 ) -> tuple[Replays, Measured]:
     """Replay of trials with the space's parameters, the others as in `params`, and what was measured.
 
-    Args:
-        like: another replay of this plant, space and vehicle, whose compiled programs serve here too.
+    `like`: another replay of this plant, space and vehicle, whose compiled programs serve here too.
     """
     paths = like.replay.paths if isinstance(like, DifferenceReplay) else None
 

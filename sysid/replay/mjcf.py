@@ -33,6 +33,7 @@ from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, resolve, turning_inertia, write_mjcf
+from sysid.replay.robot_rest import FALLS
 from sysid.replay.robot_sizes import SIZES, Size, sizes_of
 from sysid.replay.robot_vehicle import vehicle_of
 from sysid.replay.rollout import quaternion_product
@@ -53,8 +54,7 @@ class Motion:
     qpos: jax.Array
     qvel: jax.Array
     act: jax.Array
-    warm: jax.Array
-    """Where the contact solver starts."""
+    warm: jax.Array  # where the contact solver starts
 
 
 def mjcf_model(
@@ -63,10 +63,10 @@ def mjcf_model(
     timestep: float | None = None, effects: Sequence[str] = (), room_fixed: bool | None = None,
     calibrate: bool = False,
 ) -> Model:
-    """A differential drive from an MJCF or URDF file.
+    """A differential drive from an MJCF or URDF file; a free joint, a floor or actuators on its wheels are added where
+    missing.
 
-    A model without a free joint, a floor or actuators on its wheels gets them. A command is turned into wheel speeds
-    with the nominal radius and track, and the odometry adds up the wheels' speeds with the same.
+    Commands become wheel speeds, and wheel speeds odometry, with the nominal radius and track.
 
     Args:
         path: of the file; meshes are looked for beside it.
@@ -77,14 +77,15 @@ def mjcf_model(
         wheel_radius, track: nominal, of controller and odometry [m]; by default those of the file.
         timestep: physics step [s]; by default the file's.
         effects: of the catalogue, around the model; for example command_delay.
-        calibrate: also fit what a first calibration finds: true radii and track (`wheels.radius`, `wheels.difference`,
-            `wheels.track`), and delays, scales and the tracked point around the model, where a log shows them.
+        calibrate: also fit true radii and track (`wheels.radius`, `wheels.difference`, `wheels.track`), and delays,
+            scales and the tracked point around the model, where a log shows them.
         room_fixed: it matters where in the room it starts; by default where the world has more than planes in it.
 
-    Raises:
-        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
+    FileNotFoundError or ValueError names the file, the rule and the remedy.
     """
     robot = load_robot(Path(path), wheels, wheel_radius, track, timestep, regulated=calibrate)
+    if robot.falls:
+        raise ValueError(f"{path}: {FALLS}.")
     host = robot.host
     bounds, entries = _searched(robot, parameters, calibrate)
     # A mass scales its inertia: before an inertia is set by itself.

@@ -26,16 +26,13 @@ def steps_mjx(text: str | None) -> bool:
 
 
 def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> Model:
-    """The model that `--model` names.
+    """The model that `--model` names; FileNotFoundError or ValueError where it is none.
 
     Args:
         text: an MJCF, URDF or xacro file, or FILE.py, or FILE.py:NAME. NAME (by default `model`) is a `Model`, or a
             function that makes one from the log's `VehicleSpec`.
         wheels: of a robot file, joints or actuators of the driven wheels, left and right.
         parameters: of such a file, dotted paths of what to fit.
-
-    Raises:
-        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
     """
     file, _, attribute = text.rpartition(":") if ".py:" in text else (text, "", "model")
     path = Path(file)

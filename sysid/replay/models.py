@@ -27,8 +27,7 @@ from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body, Odometry, Parameter, VehicleParams, parameters_of
 
-AROUND = ("command", "sensing", "outside")
-"""Places of effects that need to know nothing of what is inside a model."""
+AROUND = ("command", "sensing", "outside")  # places of effects that need to know nothing of what is inside a model
 Bounds = tuple[float, float, float] | tuple[float, float, float, str]
 """Initial value, lowest, highest, and, where it has one, the unit."""
 
@@ -37,10 +36,8 @@ Bounds = tuple[float, float, float] | tuple[float, float, float, str]
 class Parameters:
     """Parameters of a model that is not a vehicle file: what `VehicleParams` is to the simulator's vehicle."""
 
-    values: dict[str, jax.Array]
-    """() each, by name."""
-    effects: tuple = ()
-    """Effects around the model, of the places `AROUND`."""
+    values: dict[str, jax.Array]  # () each, by name
+    effects: tuple = ()  # effects around the model, of the places `AROUND`
     about: tuple[tuple[str, Parameter], ...] = struct.field(pytree_node=False, default=())
     """Unit, bounds and initial value (as `neutral`) of each of `values`."""
     room_fixed: bool = struct.field(pytree_node=False, default=False)
@@ -54,8 +51,7 @@ class Twin:
     spec: VehicleSpec
     params: VehicleParams
     shared: Mapping[str, tuple[str, float, float]]
-    """Parameter of the model -> that of the vehicle with its meaning; the value there is a factor times it plus an
-    offset."""
+    """Parameter of the model -> that of the vehicle, and the factor and offset that its value takes there."""
 
 
 @dataclass(frozen=True)
@@ -63,16 +59,12 @@ class Model:
     """A model that is fitted in place of the simulator's vehicle."""
 
     name: str
-    plant: Plant
-    """Its functions take `Parameters`."""
-    params: Parameters
-    """Where the search starts."""
+    plant: Plant  # its functions take `Parameters`
+    params: Parameters  # where the search starts
     write: Callable[[Path, Parameters], Path] | None = None
     """Writes the fitted model into a folder in its own format; returns the file."""
-    notes: tuple[str, ...] = ()
-    """What of its file was left out or replaced."""
-    around: tuple[str, ...] = ()
-    """Effects that it may have around it: a fit adds those that a log shows."""
+    notes: tuple[str, ...] = ()  # what of its file was left out or replaced
+    around: tuple[str, ...] = ()  # effects that it may have around it: a fit adds those that a log shows
     vehicle: Callable[[Parameters, VehicleSpec], Twin | str] | None = None
     """The vehicle of the simulator that drives alike, or why there is none."""
 
@@ -96,12 +88,10 @@ def measured_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...], 
                      receipt: bool = False) -> tuple[str, ...]:
     """Effects that a vehicle with slip has in a fit besides those of its preset; they start where they do nothing.
 
-    On a differential drive passive wheels resist sideways with their speed, and their axle may pivot: then the driven
-    wheels alone carry what a turn shifts, and brake by it. Bearings and motors resist with speed (`losses`): while the
-    torque is at its limit nothing makes up for it. A wheel that skids is thrown by its own inertia, of which the
-    rotor of its motor may be the most. Soft springs let a vehicle nod, and its wheels turn with that.
-    Readings of the odometry have an age of their own, which shows against an outside pose; so has an outside pose that
-    is stamped when it is received (`receipt`), which shows against the odometry.
+    On a differential drive passive wheels resist sideways, and their axle may pivot: then the driven wheels alone carry
+    what a turn shifts. Bearings and motors resist with speed (`losses`). A wheel that skids is thrown by its own
+    inertia, mostly its motor's. Soft springs let a vehicle nod. Readings of the odometry have an age, which shows
+    against an outside pose, and so has a pose stamped at `receipt`.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):
         return ()
@@ -123,10 +113,9 @@ def gyro_effects(trials: Sequence[Trial]) -> tuple[str, ...]:
 def calibration_effects(params: Any, spec: VehicleSpec, trials: tuple[Trial, ...]) -> tuple[str, ...]:
     """What a usual first calibration finds, where it is known to show: sizes of the wheels, and of what measures them.
 
-    A command fixes how fast wheels turn, an outside pose how far the vehicle comes by that: both together show radii
-    and track. The odometry beside them shows the sizes that it takes for them, and the pose itself which point of the
-    vehicle it follows. Without an outside pose nothing separates them. On a skid drive wheels slip in every turn, and
-    the track has no part of its own in that.
+    Commands and an outside pose together show radii and track, the odometry beside them the sizes that it takes for
+    them, and the pose which point it follows. Without an outside pose nothing separates them. On a skid drive wheels
+    slip in every turn, and the track has no part of its own in that.
     """
     if not any(effect.name == "slip_traction" for effect in params.effects):
         return ()
@@ -154,8 +143,7 @@ def effects_around(model: Model, trials: tuple[Trial, ...]) -> tuple[str, ...]:
 
 
 def calibrated(model: Model, trials: tuple[Trial, ...]) -> tuple[Model, tuple[str, ...]]:
-    """A model with `effects_around` it, and names of their parameters that a fit leaves alone: of the limits of
-    acceleration that of each wheel is enough."""
+    """A model with `effects_around` it, and names of their parameters that a fit leaves alone."""
     names = effects_around(model, trials)
     limit = make_effects(("acceleration_limit",))[0]
     if limit.name not in names or limit.name in {effect.name for effect in model.params.effects}:
@@ -281,11 +269,9 @@ class Surrounded:
     """State of a model with what is around it."""
 
     inner: Any
-    memory: tuple
-    """Of the effects."""
+    memory: tuple  # of the effects
     encoder: Odometry
-    reading: Odometry
-    """The same after the effects of place `sensing`."""
+    reading: Odometry  # the same after the effects of place `sensing`
     diverged: jax.Array  # () bool
 
 
@@ -363,7 +349,7 @@ def with_surroundings(
     """Plant of a bare model: adds the odometry's pose, the effects around it and a guard against what is not finite.
 
     Args:
-        bare: the model by itself, which observes (5,) x, y, yaw of the body, v and omega of the odometry.
+        bare: observes (5,) x, y, yaw of the body, v and omega of the odometry.
         wheel_radius, track: nominal [m]; for effects that count in steps of wheels.
         drive: as in `Host`, where the host steps it more quickly.
     """

@@ -1,8 +1,7 @@
 """Replay of a model that the host steps by itself: what is around it is traced, its own steps are not.
 
-C MuJoCo steps a small robot on a core some hundred times as fast as MJX does, and nothing has to be compiled first.
-Commands go through their effects for a whole drive, the host drives it, and what it observed goes through the effects
-of the odometry and the outside pose, as if a plant had just made it.
+C MuJoCo steps a small robot some hundred times as fast as MJX, without compilation. Commands go through their effects
+for a whole drive, the host drives it, and what it observed goes through the effects of odometry and outside pose.
 """
 
 from __future__ import annotations
@@ -15,14 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.replay.cores import on_processor
 from sysid.replay.delays import delay_apart, delayed
 from sysid.replay.records import Batch, Plant, Simulated
-from sysid.replay.rollout import Replay, simulate_one
+from sysid.replay.rollout import simulate_one
 
 FEW, MANY = 4, 32
-"""Parameter sets whose commands and readings are computed together: searches ask for a dozen other numbers of them, and
-each would be compiled."""
+"""Parameter sets whose commands and readings are computed together: each other number would be compiled."""
 
 
 class HostReplay:
@@ -35,10 +32,8 @@ class HostReplay:
         recorded = replace(host.recorded, frame=plant.frame)
 
         def before(values: jax.Array, one: Batch) -> tuple[Any, Any, jax.Array, jax.Array]:
-            """Values of the model, its state at the start, commands (S, 2) of every physics step, and where it starts.
-
-            It drives from the origin where that does not matter: sets that differ in readings alone share a drive.
-            """
+            """Values of the model, its state at the start, commands (S, 2) of every physics step, and where it starts:
+            at the origin where that does not matter, so that sets which differ in readings alone share a drive."""
             params, start = set_values(values), one.start
             for effect in params.effects:
                 start = effect.reference(start) if hasattr(effect, "reference") else start
@@ -95,8 +90,7 @@ class HostReplay:
 
 
 def _in_blocks(function: Callable[..., Any], *arrays: np.ndarray) -> Any:
-    """What a function makes of arrays (N, ...), in blocks of `MANY` rows, or of `FEW` where there are no more; the last
-    block is filled up with its last row."""
+    """What a function makes of arrays (N, ...), in blocks of `MANY` or `FEW` rows; the last is filled up."""
     count, found = len(arrays[0]), []
     size = FEW if count <= FEW else MANY
     for first in range(0, count, size):
@@ -114,10 +108,3 @@ def _moved(motion: jax.Array, start: jax.Array) -> jax.Array:
     x, y = motion[:, 0], motion[:, 1]
     pose = [start[0] + cos * x - sin * y, start[1] + sin * x + cos * y, start[2] + motion[:, 2]]
     return jnp.concatenate([jnp.stack(pose, axis=-1), motion[:, 3:]], axis=-1)
-
-
-def replay_of(plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]) -> Replay | HostReplay:
-    """The quickest replay of a plant here."""
-    if plant.host is not None and on_processor():
-        return HostReplay(plant, batch, set_values)
-    return Replay(plant, batch, set_values)

@@ -1,9 +1,8 @@
 """Drives in pieces side by side: on an accelerator a replay takes as long as its steps come one after the other.
 
-How a vehicle moves depends on little more than the last seconds: wheels, controllers and delays forget. A long drive is
-cut into pieces that are replayed at the same time, each from a while before it begins, with the speeds that were
-measured there; the motion within the pieces is then put together to one drive. What lasts longer, the integral of a
-controller or a battery that sags, begins anew in each: searches use pieces on their way and end on whole drives.
+Wheels, controllers and delays forget: pieces are replayed at the same time, each from a while before it begins with the
+speeds measured there, and put together to one drive. What lasts longer (a controller's integral, a battery that sags)
+begins anew in each: searches use pieces on their way and end on whole drives.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from sysid.logs.records import Trial, command_in_force
 
 LENGTH = 2.75  # s, of a piece
 OVERLAP = 2.0
-"""Time that is replayed before each [s]: whitened motion of a vehicle fitted to a plant log then differs by 0.2 of its
-noise (0.05 with 3 s, 0.3 with 1.5 s); the last steps of a search, on whole drives, make up for it."""
+"""Time that is replayed before each [s]: whitened motion differs by 0.2 of its noise (0.05 with 3 s, 0.3 with 1.5 s).
+"""
 AROUND = 0.1  # s, over which the speeds at the begin of a piece are averaged
 
 

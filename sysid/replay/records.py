@@ -21,41 +21,33 @@ YAW_COLUMNS = (2, 5)
 class Host:
     """A model that the host steps by itself, and what is traced around it."""
 
-    place: Callable[[Any, jax.Array], Any]
-    """(params, start (5,)) -> state of the bare model."""
+    place: Callable[[Any, jax.Array], Any]  # (params, start (5,)) -> state of the bare model
     commands: Callable[[Any, jax.Array], jax.Array]
     """(params, commands (S, 2)) -> the same behind the effects on commands."""
     drive: Callable[[dict[str, np.ndarray], Any, np.ndarray, int, np.ndarray], np.ndarray]
     """(values (N,) by name, states (N, B), commands (N, B, W + S, 2), warm-up steps W, starts (N, B, 3)) ->
     (N, B, S, 6) x, y, yaw, v, omega, and 1 from where it diverged, after each step."""
-    recorded: Plant
-    """A plant whose commands are what was observed."""
+    recorded: Plant  # A plant whose commands are what was observed
 
 
 @dataclass(frozen=True)
 class Plant:
     """A vehicle as pure functions of one instance."""
 
-    place: Callable[[Any, jax.Array], Any]
-    """(params, start (5,) x, y, yaw, v, omega) -> state."""
-    substep: Callable[[Any, Any, jax.Array], Any]
-    """(params, state, command (2,)) -> state after one physics step."""
+    place: Callable[[Any, jax.Array], Any]  # (params, start (5,) x, y, yaw, v, omega) -> state
+    substep: Callable[[Any, Any, jax.Array], Any]  # (params, state, command (2,)) -> state after one physics step
     observe: Callable[[Any], jax.Array]
     """state -> (9,): x, y, yaw of the reference point; x, y, yaw, v, omega of the odometry; 1 if it diverged."""
-    dt: float
-    """Physics step [s]."""
+    dt: float  # physics step [s]
     move: Callable[[Any, jax.Array], Any]
     """(state, start (5,)) -> the same motion at the start's pose, with the odometry at its origin."""
     substeps: Callable[[Any, Any, jax.Array], Any] | None = None
     """(params, state, commands (K, 2)) -> state after K physics steps, where there is a quicker way than one by one."""
     record: Callable[[Any, Any, jax.Array], jax.Array] | None = None
-    """(params, state, commands (R, K, 2)) -> observed (R, 9) after each K physics steps, where an accelerator has a
-    quicker way."""
+    """(params, state, commands (R, K, 2)) -> observed (R, 9) after each K physics steps, if there is a quicker way."""
     frame: float | None = None
-    """Time between the frames of the odometry [s], where it is known: reported speeds are means over it, low-passed
-    once a frame."""
-    host: Host | None = None
-    """Where the host steps it more quickly."""
+    """Time between frames of the odometry [s], if known: speeds are means over it, low-passed once a frame."""
+    host: Host | None = None  # where the host steps it more quickly
     arithmetic: bool = False
     """Whether its steps are arithmetic on single numbers, without products of matrices or solvers."""
 
@@ -66,8 +58,7 @@ class FreeVehicle:
 
     plant: Plant
     params: Any
-    names: tuple[str, ...]
-    """Of the free ones."""
+    names: tuple[str, ...]  # of the free ones
 
 
 @struct.dataclass

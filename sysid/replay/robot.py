@@ -15,20 +15,15 @@ class Robot:
     """A compiled differential drive and where its parts are."""
 
     path: Path
-    spec: Any
-    """The editable mujoco.MjSpec."""
+    spec: Any  # the editable mujoco.MjSpec
     host: mujoco.MjModel
-    root: int
-    """Address of the free joint in qpos."""
-    speed: int
-    """Address of the free joint in qvel."""
+    root: int  # address of the free joint in qpos
+    speed: int  # address of the free joint in qvel
     wheels: tuple[int, ...]
     """Addresses of the driven wheels in qvel: one to three on the left, then as many on the right."""
     actuators: tuple[int, ...]
-    sign: tuple[float, ...]
-    """1 where a positive speed of the joint drives forwards."""
-    motors: bool
-    """The actuators take a torque, and not a speed."""
+    sign: tuple[float, ...]  # 1 where a positive speed of the joint drives forwards
+    motors: bool  # the actuators take a torque, and not a speed
     drive_gain: tuple[float, float]
     """Gain of a speed controller before motors, and the highest stable one [N m s/rad over the motor's gain]."""
     point: np.ndarray  # (3,) middle between the driven wheels, root's frame
@@ -36,20 +31,15 @@ class Robot:
     wheel_radius: float
     track: float
     rest: np.ndarray  # qpos after SETTLE
-    added: tuple[int, ...] = ()
-    """Actuators that the file does not have."""
-    sliding: tuple[int, ...] = ()
-    """Geoms that stand on the floor and neither turn nor swivel."""
-    distance: float = 0.0
-    """Between the driven wheels, as the file says [m]."""
-    notes: tuple[str, ...] = ()
-    """What was left out of the file."""
+    added: tuple[int, ...] = ()  # actuators that the file does not have
+    sliding: tuple[int, ...] = ()  # geoms that stand on the floor and neither turn nor swivel
+    distance: float = 0.0  # between the driven wheels, as the file says [m]
+    notes: tuple[str, ...] = ()  # what was left out of the file
     integrals: tuple[int, ...] = ()
     """Actuators that take the same targets and pull by how far their wheels lag behind; none, or one for each wheel."""
-    spin: float = 0.0
-    """Inertia of a driven wheel, motor included [kg m^2]."""
-    load: float = 0.0
-    """Inertia that it speeds up, its share of the vehicle's included [kg m^2]."""
+    spin: float = 0.0  # inertia of a driven wheel, motor included [kg m^2]
+    load: float = 0.0  # inertia that it speeds up, its share of the vehicle's included [kg m^2]
+    falls: bool = False  # whether it falls over while nothing drives it, as a robot that balances does
 
     @property
     def joints(self) -> tuple[int, ...]:

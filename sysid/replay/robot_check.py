@@ -11,8 +11,9 @@ import numpy as np
 from sysid.replay.robot import Robot
 from sysid.replay.robot_contacts import radius_of
 from sysid.replay.robot_drive import RAMP, SECONDS, SPIN, RobotDrive
+from sysid.replay.robot_rest import FALLS
 
-ALONE = 0.999  # of the weight on two wheels, from which nothing else carries a robot
+DRAGS = 0.3  # friction of what slides on the floor: a ball or a skid of plastic has less
 STRAIGHT = 0.1  # share by which the speed may differ from the command
 TURNS = 0.75  # share of the commanded rate on the spot, below which something keeps a robot from turning
 DENSE = 20_000.0  # kg/m^3, of the box around a robot: gold
@@ -25,16 +26,11 @@ LIGHT = 0.02  # share of the weight below which what touches the floor is not li
 class Check:
     """A robot at rest and in two drives of `SECONDS`."""
 
-    loads: dict[str, float]
-    """Share of the weight that each geom on the floor carries."""
-    command: tuple[float, float]
-    """Speed [m/s] and yaw rate [rad/s] that were asked for, one drive each."""
-    speed: float
-    """Along the vehicle where it should drive straight [m/s]."""
-    drift: float
-    """Yaw rate there [rad/s]."""
-    rate: float
-    """Yaw rate where it should turn on the spot [rad/s]."""
+    loads: dict[str, float]  # share of the weight that each geom on the floor carries
+    command: tuple[float, float]  # speed [m/s] and yaw rate [rad/s] that were asked for, one drive each
+    speed: float  # along the vehicle where it should drive straight [m/s]
+    drift: float  # yaw rate there [rad/s]
+    rate: float  # yaw rate where it should turn on the spot [rad/s]
 
     @property
     def drives_straight(self) -> bool:
@@ -69,12 +65,13 @@ def _loads(robot: Robot) -> dict[str, float]:
     host, data = robot.host, mujoco.MjData(robot.host)
     data.qpos[:] = robot.rest
     mujoco.mj_forward(host, data)
+    root = host.body_rootid[host.jnt_bodyid[robot.joints[0]]]
     found: dict[str, float] = {}
     force = np.zeros(6)
     for number in range(data.ncon):
         contact = data.contact[number]
         ours = [int(geom) for geom in (contact.geom1, contact.geom2) if host.geom_bodyid[geom] != 0]
-        if len(ours) != 1:
+        if len(ours) != 1 or host.body_rootid[host.geom_bodyid[ours[0]]] != root:
             continue
         mujoco.mj_contactForce(host, data, number, force)
         name = host.geom(ours[0]).name or f"geom {ours[0]}"
@@ -129,13 +126,11 @@ def _missing(robot: Robot, check: Check) -> list[str]:
     if carried < 0.3:
         found.append(f"the driven wheels carry {carried:.0%} of the weight: they may spin. Check the heights of "
                      "casters and wheels, and the centre of mass")
-    if len(robot.wheels) == 2 and carried > ALONE:
-        found.append("it stands on its two driven wheels alone and tips: the file has no caster, or the robot balances "
-                     "by a controller of its own, which is not in the file")
-    if not check.drives_straight:
+    if robot.falls:
+        found.append(f"{FALLS}. No fit takes it so")
+    elif not check.drives_straight:
         found.append("it does not drive straight on within a tenth of the commanded speed: " + (
-            "; ".join(_limits(robot, check.command[0])) or "check axes of the wheels, what drags on the floor, and "
-            "friction"))
+            "; ".join((*_limits(robot, check.command[0]), *_drags(robot))) or "check axes of the wheels and friction"))
     if len(robot.wheels) == 2 and check.drives_straight and check.rate < TURNS * check.command[1]:
         names = [name for name in check.loads if int(host.geom_bodyid[host.geom(name).id]) not in wheels]
         cause = _coupled(robot) or (f"{', '.join(names)} drag sideways. A caster must swivel or slide" if names else
@@ -174,12 +169,32 @@ def _limits(robot: Robot, v: float) -> list[str]:
         if host.jnt_actfrclimited[joint]:
             found.append(f"joint {host.joint(joint).name} gives at most {host.jnt_actfrcrange[joint, 1]:.3g} N m "
                          "(effort, or actuatorfrcrange)")
-    for one in robot.actuators if not robot.motors and not robot.added else ():
+    for one, joint in zip(robot.actuators, joints, strict=True) if not robot.motors and not robot.added else ():
+        gain, damping = -host.actuator_biasprm[one, 2] * host.actuator_gear[one, 0] ** 2, host.dof_damping[
+            host.jnt_dofadr[joint]]
+        if damping > STRAIGHT * gain:
+            found.append(f"actuator {host.actuator(one).name} (kv {gain:.3g} N m s/rad) is held back by a damping of "
+                         f"{damping:.3g} of joint {host.joint(joint).name}: it reaches {gain / (gain + damping):.0%} "
+                         "of its speed")
         most = float(np.abs(host.actuator_ctrlrange[one]).max())
         if host.actuator_ctrllimited[one] and most * robot.wheel_radius < v:
             found.append(f"actuator {host.actuator(one).name} takes at most {most:.3g} rad/s (ctrlrange), which is "
                          f"{most * robot.wheel_radius:.3g} m/s")
     return found
+
+
+def _drags(robot: Robot) -> list[str]:
+    """What slides on the floor with so much friction that wheels pull against it."""
+    host, data = robot.host, mujoco.MjData(robot.host)
+    data.qpos[:] = robot.rest
+    mujoco.mj_forward(host, data)
+    friction: dict[int, float] = {}
+    for contact in data.contact[: data.ncon]:
+        for geom in {int(contact.geom1), int(contact.geom2)} & set(robot.sliding):
+            friction[geom] = float(contact.friction[0]) if contact.dim > 1 else 0.0
+    return [f"{host.geom(geom).name} slides on the floor with a friction of {value:.2g} (of two geoms that touch the "
+            'larger one counts, unless one has a higher priority: give it priority="1")'
+            for geom, value in friction.items() if value > DRAGS]
 
 
 def _coupled(robot: Robot) -> str:

@@ -35,8 +35,7 @@ def touches_ground(host: mujoco.MjModel, geom: int) -> bool:
 
 
 def radius_of(path: Path, host: mujoco.MjModel, body: int, known: float | None = None) -> float:
-    """Radius of the largest round geom of a wheel, of those that may touch the ground if one is round; else how far its
-    shapes reach."""
+    """Radius of the largest round geom of a wheel that may touch the ground; else how far its shapes reach."""
     round_ones = [int(one) for one in parts(host, body) if int(host.geom_type[one]) in map(int, ROUND)]
     touching = [one for one in round_ones if touches_ground(host, one)]
     sizes = [float(host.geom_size[one, 0]) for one in touching or round_ones]
@@ -71,8 +70,8 @@ def reach_of(host: mujoco.MjModel, body: int) -> float:
 
 
 def _corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Points (K, 3) of a geom in its own frame: vertices of a mesh, corners of a box, the middle of a ball, the surface
-    of an ellipsoid."""
+    """Points (K, 3) of a geom in its frame: a mesh's vertices, a box's corners, a ball's middle, an ellipsoid's
+    surface."""
     kind, mesh = int(host.geom_type[geom]), int(host.geom_dataid[geom])
     if kind == int(mujoco.mjtGeom.mjGEOM_MESH):
         first = int(host.mesh_vertadr[mesh])
@@ -120,8 +119,7 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
 def below_wheels(
     path: Path, host: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int], radius: float,
 ) -> dict[str, str]:  # fmt: skip
-    """Geoms that reach so far below the driven wheels that these would hang in the air, with a note for each: mostly
-    boxes that stand in for meshes."""
+    """Geoms that reach so far below the driven wheels that these would hang in the air; a note for each."""
     floor = min(float(data.xpos[body, 2]) for body in bodies) - radius
     wheels = {int(host.body_weldid[body]) for body in bodies}
     found = {}
@@ -143,10 +141,9 @@ def below_wheels(
 def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
     """What a URDF leaves to its simulator, a note for each change.
 
-    Wheels roll on the middle of their width, as spheres: a stiff cylinder stands on its two edges, scrubs in every turn
-    and turns as if the outer edges were its track. Parts of one robot do not touch each other. Joints with an end, of
-    arms, heads and suspensions, are held: their motors and springs are not in the file. A driven wheel is held at its
-    speed, whatever its bearing.
+    Wheels roll on the middle of their width, as spheres: a stiff cylinder stands on its two edges and scrubs in every
+    turn. Parts of one robot do not touch each other. Joints with an end are held: their motors and springs are not in
+    the file.
     """
     notes = []
     driven = {joint.parent.name for joint in spec.joints if joint.name in joints}
@@ -160,12 +157,8 @@ def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
             geom.solref, geom.solimp, geom.solmix = FIRM_TIME, FIRM, ALONE
     for joint in list(spec.joints):
         if joint.name in joints:
-            if np.any(joint.frictionloss) or np.any(joint.damping):
-                notes.append(f"{path.name}: friction and damping of joint {joint.name} are left out: an added servo "
-                             "would make up for them")
-            joint.frictionloss = 0.0
-            joint.damping = np.zeros_like(joint.damping)
-        elif joint.type == mujoco.mjtJoint.mjJNT_SLIDE or (
+            continue
+        if joint.type == mujoco.mjtJoint.mjJNT_SLIDE or (
                 joint.type == mujoco.mjtJoint.mjJNT_HINGE and np.ptp(joint.range)):
             notes.append(f"{path.name}: joint {joint.name} is held at 0: the file has no motor or spring for it")
             spec.delete(joint)
@@ -173,7 +166,7 @@ def as_in_gazebo(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
 
 
 def leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str, ...]:
-    """Exclude contacts that MJX lacks between parts of one robot, a note for each; ValueError for others."""
+    """Exclude contacts that MJX lacks, of parts of one robot and of obstacles, with notes; ValueError for others."""
     import_mjx()
     from mujoco.mjx._src.collision_driver import geom_pairs, has_collision_fn
 
@@ -186,12 +179,26 @@ def leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str
         geoms = " and ".join(f"geom {host.geom(int(geom)).name or geom!r} ({shape})"
                              for geom, shape in zip((one, other), shapes, strict=True))
         bodies = [int(host.geom_bodyid[geom]) for geom in (one, other)]
+        if declared < 0 and 0 in bodies and not _under(host, obstacle := int((one, other)[bodies.index(0)]), bodies):
+            spec.geom(host.geom(obstacle).name).contype = spec.geom(host.geom(obstacle).name).conaffinity = 0
+            left_out[("", host.geom(obstacle).name)] = (
+                f"{path.name}: MJX has no contact between {geoms}; the obstacle's contacts are left out")
+            continue
         if declared >= 0 or 0 in bodies or host.body_rootid[bodies[0]] != host.body_rootid[bodies[1]]:
             raise ValueError(f"{path}: MJX has no contact between {geoms}. Replace one by a sphere, capsule or box, or "
                              "let their contype and conaffinity keep them apart.")
         names = sorted(host.body(body).name for body in bodies)
         left_out.setdefault((names[0], names[1]), f"{path.name}: MJX has no contact between {geoms}; contacts between "
                             f"their bodies {names[0]} and {names[1]} are left out")
-    for first, second in left_out:
+    for first, second in filter(lambda names: names[0], left_out):
         spec.add_exclude(name=f"{first}_{second}_left_out", bodyname1=first, bodyname2=second)
     return tuple(left_out.values())
+
+
+def _under(host: mujoco.MjModel, ground: int, bodies: Sequence[int]) -> bool:
+    """Whether a geom of the world reaches under a robot of these bodies where it starts."""
+    data = mujoco.MjData(host)
+    mujoco.mj_kinematics(host, data)
+    root = max(int(host.body_rootid[body]) for body in bodies)
+    place = (data.xpos[root] - data.geom_xpos[ground]) @ data.geom_xmat[ground].reshape(3, 3)
+    return bool((np.abs(place - host.geom_aabb[ground, :3])[:2] < host.geom_aabb[ground, 3:5]).all())

@@ -98,8 +98,8 @@ class RobotDrive:
 
 
 def rolling_ratio(robot: Robot) -> float:
-    """Way of a straight drive over what its wheels turn times their radius: MuJoCo's contacts are soft, wheels sink
-    into the floor and roll on less than their radius. 1 where the robot does not drive."""
+    """Way of a straight drive over what its wheels turn times their radius: soft contacts let them sink, and roll on
+    less. 1 where the robot does not drive."""
     steps, half = round(SECONDS / robot.host.opt.timestep), round(SECONDS / 2 / robot.host.opt.timestep)
     commands = np.zeros((1, 1, steps, 2))
     ramp = np.minimum(np.arange(1, steps + 1) * robot.host.opt.timestep / RAMP, 1.0)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import mujoco
 import numpy as np
 
 from sysid.replay import xacro_text
+from sysid.replay.stated_drive import StatedDrive, stated_drive
 from sysid.replay.urdf_links import compiler_of, complete_links
 from sysid.replay.xacro_text import around, package_folders
 from whill_mjx.io.reading import LONGEST_REASON, MB, decoded, read_bytes
@@ -34,15 +36,19 @@ mujoco.set_mju_user_warning(lambda text: None)
 """What is wrong in a model is raised; MuJoCo's own handler writes MUJOCO_LOG.TXT where the command was called."""
 
 
-def read_robot(
-    path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None,
-) -> tuple[Any, list[str], dict[str, float] | None]:  # fmt: skip
-    """The editable model of an MJCF, URDF or xacro file, a note for each mesh that was replaced, and the friction that
-    a URDF states for Gazebo by link; None for MJCF, which has its own.
+@dataclass(frozen=True)
+class RobotFile:
+    """What was read."""
 
-    Raises:
-        FileNotFoundError, ValueError: naming the file, the rule and the remedy.
-    """
+    spec: Any  # the editable mujoco.MjSpec
+    notes: list[str]  # on what was replaced or left out
+    friction: dict[str, float] | None = None
+    """Of links, as a URDF states it for Gazebo; None for MJCF, which has its own."""
+    drive: StatedDrive = StatedDrive()  # joints that it says are driven
+
+
+def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None) -> RobotFile:
+    """The editable model of an MJCF, URDF or xacro file; FileNotFoundError or ValueError where it is none."""
     text = decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF, URDF or xacro file."))
     xacro = path.suffix == ".xacro" or "<xacro:" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     text, left_out = expand_xacro(path) if xacro else (text, [])
@@ -51,14 +57,16 @@ def read_robot(
     except ElementTree.ParseError:
         if path.suffix not in ROBOT_FILES:
             raise ValueError(f"{path}: {OTHER}") from None
-        return mujoco.MjSpec.from_file(str(path)), [], None  # MuJoCo says where the mistake is
+        return RobotFile(mujoco.MjSpec.from_file(str(path)), [])  # MuJoCo says where the mistake is
     if top.tag not in ("robot", "mujoco"):
         raise ValueError(f"{path}: it begins with <{top.tag[:40]}>. {OTHER}")
     if top.tag != "robot":
         spec = mujoco.MjSpec.from_string(text) if xacro else mujoco.MjSpec.from_file(str(path))
-        return spec, [*left_out, *_place_meshes(path, spec)], None
+        return RobotFile(spec, [*left_out, *_place_meshes(path, spec)])
+    drive = stated_drive(top)
     notes = [*left_out, *complete_links(path, top), *_place_urdf_meshes(path, top, wheels, wheel_radius)]
-    return mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode")), notes, _frictions(top)
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode"))
+    return RobotFile(spec, notes, _frictions(top), drive)
 
 
 def _frictions(top: ElementTree.Element) -> dict[str, float]:
@@ -74,10 +82,7 @@ def _frictions(top: ElementTree.Element) -> dict[str, float]:
 
 
 def expand_xacro(path: Path) -> tuple[str, list[str]]:
-    """Text of a xacro file with all macros expanded, and a note on each file of another package that is missing.
-
-    A process of its own does it: what stands in the file may never end.
-    """
+    """Text of a xacro file with all macros expanded, by a process that may be stopped, and notes on missing files."""
     if importlib.util.find_spec("xacro") is None:
         raise ValueError(f"{path}: xacro files need the package xacro. Install it: {XACRO}; or expand the file where "
                          "you have ROS: xacro FILE > robot.urdf.")
@@ -100,11 +105,9 @@ def expand_xacro(path: Path) -> tuple[str, list[str]]:
 
 
 def find_mesh(folder: Path, name: str) -> Path | None:
-    """The file of a mesh that MuJoCo can read, or None.
+    """The file beside a robot file's folder of a mesh that MuJoCo can read, or None.
 
-    Args:
-        folder: of the robot file.
-        name: as in it: package://PACKAGE/PATH, model://..., file://PATH, an absolute or a relative path.
+    `name`: package://PACKAGE/PATH, model://..., file://PATH, an absolute or a relative path.
     """
     scheme, _, rest = name.partition("://") if "://" in name else ("", "", name)
     rest = rest.replace("\\", "/")

@@ -13,7 +13,7 @@ import numpy as np
 from sysid.replay.robot import Robot
 from sysid.replay.robot_contacts import as_in_gazebo, as_round_wheels, below_wheels, leave_out_contacts, radius_of
 from sysid.replay.robot_files import read_robot
-from sysid.replay.robot_rest import NEAR, near_floor, raise_supports, settle, sliding
+from sysid.replay.robot_rest import NEAR, falls, near_floor, raise_supports, settle, sliding
 from sysid.replay.robot_servos import (
     add_servos,
     are_motors,
@@ -68,11 +68,13 @@ def load_robot(
     root, speed, turning = int(host.jnt_qposadr[free]), int(host.jnt_dofadr[free]), host.jnt_dofadr[ids].tolist()
     supports = _rest(draft, speed, turning, radius)
     inertias = [wheel_inertias(host, one, radius, len(ids)) for one in ids]
+    spin, load = (float(one) for one in np.mean(inertias, axis=0))
     return Robot(path, draft.spec, host, root, speed, tuple(turning), actuators, sign,
                  are_motors(path, host, actuators), drive_gain(host, actuators, inertias), rotation.T @ middle,
                  rotation.T @ np.cross(left, [0.0, 0.0, 1.0]), radius, distance if track is None else track,
                  data.qpos.copy(), tuple(actuators[one] for one in bare), supports, distance, tuple(draft.notes),
-                 integrals(host, ids), *(float(one) for one in np.mean(inertias, axis=0)))
+                 integrals(host, ids), spin, load,
+                 falls=len(ids) == 2 and falls(host, data.qpos.copy(), speed, body, rotation.T @ left))
 
 
 @dataclass
@@ -81,10 +83,8 @@ class _Draft:
 
     path: Path
     spec: Any
-    joints: tuple[str, ...]
-    """Of the driven wheels."""
-    stated: dict[str, float] | None
-    """Friction of links as a URDF states it for Gazebo; None for MJCF."""
+    joints: tuple[str, ...]  # of the driven wheels
+    stated: dict[str, float] | None  # friction of links as a URDF states it for Gazebo; None for MJCF
     notes: list[str]
     host: mujoco.MjModel = field(init=False)
     data: mujoco.MjData = field(init=False)
@@ -108,13 +108,14 @@ class _Draft:
 
 def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timestep: float | None) -> _Draft:
     """The file with its free joint and names, compiled."""
-    spec, notes, stated = read_robot(path, wheels, wheel_radius)
+    file = read_robot(path, wheels, wheel_radius)
+    spec, notes, stated = file.spec, file.notes, file.friction
     try:
-        joints = wheel_joints(path, spec, wheels)
+        joints = wheel_joints(path, spec, wheels, file.drive)
     except ValueError as error:
         missing = "; ".join(note for note in notes if note.endswith("left out"))
         raise ValueError(f"{error}{f' ({missing}.)' if missing else ''}") from None
-    notes += [*as_plain_wheels(path, spec, joints), *_with_weight(path, spec)]
+    notes += [*as_plain_wheels(path, spec, joints, file.drive), *_with_weight(path, spec)]
     if stated is not None:
         if len(joints) == 2:  # the file has none
             spec.option.impratio, spec.option.cone = STIFF, mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -150,7 +151,8 @@ def _drive(draft: _Draft, radius: float, regulated: bool) -> list[int]:
     """Give wheels what turns them; numbers of those that the file has nothing for."""
     spec, host, joints = draft.spec, draft.host, draft.joints
     inertias = [wheel_inertias(host, one, radius, len(joints)) for one in draft.ids]
-    bare = add_servos(spec, joints, inertias)
+    bare, notes = add_servos(draft.path, spec, joints, inertias)
+    draft.notes += notes
     if regulated and is_stable(host, joints, inertias):
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     if regulated:
@@ -203,6 +205,8 @@ def _rest(draft: _Draft, speed: int, turning: Sequence[int], radius: float) -> t
 def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
     """Give the model a free joint and names to its bodies and geoms, where it has none."""
     spec.compiler.fusestatic = False
+    for key in list(spec.keys):  # of the file's own coordinates and actuators, which change
+        spec.delete(key)
     named = {body.name for body in spec.bodies}
     for k, body in enumerate(spec.bodies):
         if not body.name:

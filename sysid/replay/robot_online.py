@@ -20,14 +20,10 @@ class OnlineRobot:
     """One robot on a flat floor, with its own controller; nothing else is in its world."""
 
     def __init__(self, path: str | Path, wheels: Sequence[str] = ()) -> None:
-        """Compile an MJCF, URDF or xacro file and stand at the origin.
+        """Compile an MJCF, URDF or xacro file and stand at the origin; FileNotFoundError or ValueError where it is
+        none.
 
-        Args:
-            path: of the file.
-            wheels: joints or actuators of the driven wheels, left and right; by default those that their names show.
-
-        Raises:
-            FileNotFoundError, ValueError: naming the file, the rule and the remedy.
+        `wheels`: joints or actuators of the driven wheels, left and right; by default those that their names show.
         """
         if not Path(path).is_file():
             raise FileNotFoundError(f"{path}: no such robot file. Give an MJCF, URDF or xacro file.")
@@ -67,11 +63,7 @@ class OnlineRobot:
         """(5,) x, y [m], yaw [rad], v [m/s], omega [rad/s] as its wheels report them, from its start."""
 
     def advance(self, v: float, omega: float, seconds: float) -> None:
-        """Drive with a command, v [m/s], omega [rad/s].
-
-        Raises:
-            ValueError: the motion is no longer finite.
-        """
+        """Drive with a command, v [m/s], omega [rad/s]; ValueError where the motion is no longer finite."""
         data, dt = self._data, float(self._model.opt.timestep)
         data.ctrl[:] = self._drive.controls(np.array([v, omega]))
         self._due += seconds

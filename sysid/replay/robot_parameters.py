@@ -50,10 +50,8 @@ class Entry:
     rows: tuple[int, ...]
     column: int | None
     unit: str
-    ids: tuple[int, ...]
-    """Of the elements that the path names."""
-    servo: tuple[int, ...] = ()
-    """Columns of actuator_biasprm with which a servo pulls back what its gain pulls."""
+    ids: tuple[int, ...]  # of the elements that the path names
+    servo: tuple[int, ...] = ()  # columns of actuator_biasprm with which a servo pulls back what its gain pulls
 
     @property
     def kind(self) -> str:
@@ -187,8 +185,7 @@ def _pattern(names: Sequence[str], known: Mapping[str, int]) -> str | None:
 
 
 def turning_inertia(robot: Robot) -> str:
-    """Path of the inertia of the vehicle's heaviest body: robot files often have a placeholder there, and the rest of
-    its controller's lag shows in turns."""
+    """Path of the inertia of the heaviest body: often a placeholder, with the rest of the controller's lag in it."""
     host = robot.host
     root = host.body_rootid[host.jnt_bodyid[robot.joints[0]]]
     heaviest = int(np.where(host.body_rootid == root, host.body_mass, 0.0).argmax())
@@ -196,11 +193,8 @@ def turning_inertia(robot: Robot) -> str:
 
 
 def drive_entries(robot: Robot) -> dict[str, tuple[Entry, float, float, float]]:
-    """Parameters of the controller that a regulated robot got, each with its start and bounds.
-
-    All follow from the inertia that a wheel speeds up: lags of up to a second, oscillations of up to 7 Hz, and
-    accelerations of up to 30 m/s^2.
-    """
+    """Parameters of the controller that a regulated robot got, each with its start and bounds, by the inertia it speeds
+    up: lags of up to a second, oscillations of up to 7 Hz, accelerations of up to 30 m/s^2."""
     host, load, both = robot.host, robot.load, robot.integrals
     found = {}
     if robot.added:

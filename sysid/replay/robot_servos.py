@@ -31,7 +31,7 @@ def wheel_inertias(host: mujoco.MjModel, joint: int, radius: float, count: int) 
 
 
 def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
-    """Remove actuators of the wheels that take neither a torque nor a speed, and those on tendons, a note for each."""
+    """Remove the wheels' actuators that take neither torque nor speed or are on tendons, and sensors; with notes."""
     notes = []
     turned = {one.name for one in spec.tendons if any(wrap.target is not None and wrap.target.name in joints
                                                       for wrap in one.path)}
@@ -39,8 +39,11 @@ def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
         on_tendon = one.trntype == mujoco.mjtTrn.mjTRN_TENDON
         motor = one.biastype == mujoco.mjtBias.mjBIAS_NONE
         speed = one.biasprm[1] == 0 and one.biasprm[2] < 0 or one.dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
-        if on_tendon or (one.target in joints and not motor and not speed):
-            what = f"acts on tendon {one.target}" if on_tendon else f"holds an angle of {one.target}"
+        lags = one.dyntype not in (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_INTEGRATOR)
+        damps = one.gaintype != mujoco.mjtGain.mjGAIN_FIXED
+        if on_tendon or (one.target in joints and (lags or damps or not motor and not speed)):
+            what = (f"acts on tendon {one.target}" if on_tendon else "has a filter or a muscle" if lags else
+                    "pulls by a law of its own" if damps else f"holds an angle of {one.target}")
             instead = "nothing" if on_tendon and one.target not in turned else "servos on the wheels"
             notes.append(f"{path.name}: actuator {one.name} {what}: {instead} stands in for it"
                          .replace("wheels stands", "wheels stand"))
@@ -53,17 +56,28 @@ def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
                      "in for them")
         for one in left:
             spec.delete(one)
+    remaining = {one.name for one in spec.actuators}
+    for sensor in list(spec.sensors):
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname not in remaining:
+            spec.delete(sensor)
     return notes
 
 
-def add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> list[int]:
-    """Give velocity servos to wheels without actuators; numbers of these wheels.
+def add_servos(
+    path: Path, spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float, float]],
+) -> tuple[list[int], list[str]]:  # fmt: skip
+    """Give velocity servos to wheels without actuators; numbers of these wheels, and a note on each bearing left out.
 
-    Their gain follows from the inertia that a wheel has to speed up, its share of the vehicle's included, so that all
-    vehicles follow within the same time. MuJoCo softens a contact with the inverse inertia of what touches: a wheel
-    without a motor's rotor would creep.
+    Gains follow from the inertia that a wheel has to speed up, so that all vehicles follow within the same time. A
+    contact is softened by the inverse inertia of what touches: a wheel without a rotor would creep. A bearing's
+    friction and damping would hold a servo below its target.
     """
-    bare = [k for k, joint in enumerate(joints) if not any(one.target == joint for one in spec.actuators)]
+    bare, notes = [k for k, joint in enumerate(joints) if not any(one.target == joint for one in spec.actuators)], []
+    for joint in (spec.joint(joints[k]) for k in bare):
+        if np.any(joint.frictionloss) or np.any(joint.damping):
+            notes.append(f"{path.name}: friction and damping of joint {joint.name} are left out: an added servo would "
+                         "make up for them")
+        joint.frictionloss, joint.damping = 0.0, np.zeros_like(joint.damping)
     share = ROTOR_SHARE if len(joints) == 2 else SKID_SHARE
     time = max(SERVO_TIME, spec.option.timestep / share)
     for k in bare:
@@ -74,7 +88,7 @@ def add_servos(spec: Any, joints: Sequence[str], inertias: Sequence[tuple[float,
         joint.armature += max(share * total - wheel, 0.0)
     if bare:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    return bare
+    return bare, notes
 
 
 def regulate(
@@ -82,8 +96,8 @@ def regulate(
 ) -> None:  # fmt: skip
     """Give wheels without one an integral part beside their servo or motor, and a limit of what both pull together.
 
-    The integral part takes the same targets: torque = ki (integral of the target - angle of the wheel). A usual
-    controller of a robot's wheels is of this kind. Its gain starts where it hardly acts.
+    As usual controllers have: torque = ki (integral of the target - angle of the wheel). It starts where it hardly
+    acts.
     """
     for name, (_, total) in zip(joints, inertias, strict=True):
         joint = spec.joint(name)
@@ -127,10 +141,8 @@ def integrals(host: mujoco.MjModel, joints: Sequence[int]) -> tuple[int, ...]:
 def drive_gain(
     host: mujoco.MjModel, actuators: Sequence[int], inertias: Sequence[tuple[float, float]],
 ) -> tuple[float, float]:  # fmt: skip
-    """Gain of a speed controller before motors, and the highest with which a wheel in the air is stable.
-
-    The controller's torque is computed before a step, so it may take away at most a wheel's whole speed in one.
-    """
+    """Gain of a speed controller before motors, and the highest with which a wheel in the air is stable: computed
+    before a step, its torque may take away at most a wheel's whole speed in one."""
     wheel, total = (min(one) for one in zip(*inertias, strict=True))
     motor = max(abs(float(host.actuator_gear[one, 0] * host.actuator_gainprm[one, 0])) for one in actuators) or 1.0
     time = max(SERVO_TIME, 2 * host.opt.timestep)

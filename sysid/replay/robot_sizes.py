@@ -22,13 +22,10 @@ class Size:
     path: str
     """`wheels.radius` or `wheels.track` [m], `wheels.difference` [-], left radius less right one over their mean."""
     unit: str
-    nominal: float
-    """What the file says."""
-    geoms: tuple[tuple[int, ...], ...]
-    """Of each wheel, those on the left first."""
+    nominal: float  # what the file says
+    geoms: tuple[tuple[int, ...], ...]  # of each wheel, those on the left first
     bodies: tuple[int, ...]
-    rolling: float
-    """Radius on which a wheel rolls over that of its geom: contacts are soft, and wheels sink [-]."""
+    rolling: float  # radius on which a wheel rolls over that of its geom: contacts are soft, and wheels sink [-]
     along: tuple[np.ndarray, ...]
     """(3,) in the frames of the wheels' parents: a wheel that grows rises, a track that grows moves it outwards."""
 
@@ -59,10 +56,7 @@ class Size:
 
 
 def sizes_of(robot: Robot, rolling: float = 1.0) -> dict[str, Size]:
-    """The true sizes that may be fitted; none where a wheel rolls on something that is not round.
-
-    `rolling` is the radius on which wheels roll over that of their geoms.
-    """
+    """The true sizes that may be fitted, of round wheels; `rolling`: radius rolled on over that of geoms."""
     host, data = robot.host, mujoco.MjData(robot.host)
     mujoco.mj_kinematics(host, data)
     joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]

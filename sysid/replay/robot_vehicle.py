@@ -1,8 +1,7 @@
 """A fitted robot as a vehicle of the simulator, where its kind has one: two driven wheels and supports that slide.
 
-What the fit knows of the robot goes over value by value: its mass distribution, the true sizes of its wheels, its
-controller, friction, and all effects around it. What a contact solver has no number for, such as how a tyre creeps, is
-taken for stiff. A vehicle of the simulator can be trained, closed into the loop and exported.
+What the fit knows goes over value by value: mass distribution, true sizes of wheels, controller, friction, and all
+effects around it. What a contact solver has no number for, such as how a tyre creeps, is taken for stiff.
 """
 
 from __future__ import annotations
@@ -34,11 +33,7 @@ def vehicle_of(
 ) -> Twin | str:  # fmt: skip
     """The vehicle that drives as the robot, or the reason why there is none.
 
-    Args:
-        robot: that was fitted.
-        entries: where its parameters stand.
-        params: fitted ones.
-        spec: of the log: stated wheel radius and track, and limits of commands.
+    `entries`: where its parameters stand; `params`: fitted ones; `spec`: of the log, with stated sizes and limits.
     """
     values = {name: float(value) for name, value in params.values.items()}
     if len(robot.wheels) != 2:

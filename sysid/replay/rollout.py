@@ -1,11 +1,9 @@
 """Open-loop replay of a log, batched over trials and parameter sets: the only compiled entry point of this package.
 
 Commands are resampled to the physics grid (each holds until the next), trials are padded to one length with masks, the
-motion is recorded every few physics steps and interpolated at the measurements' own times. The vehicle comes in as
-a few functions of one instance (`Plant`), so that a test can put a small model in its place.
-
-A trial that starts in motion is settled first: the vehicle drives a while at the start's wheel speeds and is then
-moved to the start pose. Its controller, delays and slip are those of a vehicle under way, not of one that just began.
+motion is recorded every few steps and interpolated at the measurements' times. The vehicle is a few functions of one
+instance (`Plant`). A trial that starts in motion first drives a while at the start's wheel speeds, so that controller,
+delays and slip are those of a vehicle under way, and is then moved to the start pose.
 """
 
 from __future__ import annotations
@@ -21,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
-from sysid.replay import odometry, pieces
+from sysid.replay import pieces
 from sysid.replay.cores import on_all_cores, on_processor
-from sysid.replay.delays import delay_apart, delayed, reached, without
+from sysid.replay.delays import delay_apart, delayed, framed, late, reached, without
 from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, TURN, YAW_COLUMNS, Batch, Measured, Plant, Simulated
 from whill_mjx.effects.odometry_lag import OdometryLag
 from whill_mjx.effects.sensor_delay import SensorDelay
@@ -128,7 +126,7 @@ def simulate(plant: Plant, params: Any, batch: Batch) -> Simulated:
 class Replay:
     """Compiled replay of one batch for many parameter sets: `values` (N, P) go in, host arrays come out.
 
-    A call with fewer sets than an earlier one is padded to that size: a few spare rows cost less than compiling again.
+    A call with fewer sets than an earlier one is padded to that size instead of compiled again.
     """
 
     def __init__(self, plant: Plant, batch: Batch, set_values: Callable[[jax.Array], Any]):
@@ -209,22 +207,17 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
 class Commanded(NamedTuple):
     """One drive that is to be replayed."""
 
-    command: jax.Array
-    """(R, K, 2) in force in each of K physics steps between records [m/s, rad/s]."""
-    start: jax.Array
-    """(5,) x, y, yaw, v, omega."""
-    warm_up: int = 0
-    """Physics steps at the start's speeds before it."""
-    speeds: jax.Array | None = None
-    """(W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`)."""
+    command: jax.Array  # (R, K, 2) in force in each of K physics steps between records [m/s, rad/s]
+    start: jax.Array  # (5,) x, y, yaw, v, omega
+    warm_up: int = 0  # physics steps at the start's speeds before it
+    speeds: jax.Array | None = None  # (W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`)
 
 
 def path_of(plant: Plant, params: Any, commanded: Commanded, few: bool = False, gyro: bool = False) -> jax.Array:
-    """States (R + 1, 9) at the records, as `Plant.observe` gives them, of one drive; with a gyro (R + 1, 10).
+    """States (R + 1, 9) at the records, as `Plant.observe` gives them, of one drive; with a gyro's turn [rad] (R + 1,
+    10).
 
-    Args:
-        few: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
-        gyro: whether the last column is what a gyro turned [rad].
+    `few`: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
     """
     commanded = _from_reference(params, commanded)
     path = _driven(plant, _driving(plant, params), commanded, few)
@@ -254,13 +247,13 @@ def _as_sensed(plant: Plant, params: Any, commanded: Commanded, path: jax.Array,
     for column in YAW_COLUMNS:
         path = path.at[:, column].set(_unwrap(path[:, column]))
     if lag is not None and plant.frame:
-        path = path.at[:, SPEEDS].set(odometry.framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
+        path = path.at[:, SPEEDS].set(framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
     turned = path[:, 2]
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "turned"):
             turned = effect.turned(turned, gap)
     if latency is not None:
-        path = path.at[:, ODOMETRY].set(odometry.late(path[:, ODOMETRY], latency, gap))
+        path = path.at[:, ODOMETRY].set(late(path[:, ODOMETRY], latency, gap))
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "outside"):
             path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
@@ -307,11 +300,7 @@ def _begun(
 
 
 class _Programs:
-    """`path_of` for rows of drives in three programs, of which the large one serves drives of any length.
-
-    The steps of the physics take far longer to compile than all around them. They are counted when it runs, in arrays
-    with room for more records (`ROOMS`).
-    """
+    """`path_of` for rows of drives in three programs; the large one serves drives of any length (`ROOMS`)."""
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
         in_one = as_one_function if rows <= IN_ONE and plant.arithmetic else lambda function: function
@@ -358,7 +347,7 @@ class _Programs:
 class PathReplay:
     """Compiled `path_of` for rows of a fixed number: each row is a parameter set on one trial of a batch.
 
-    It is compiled once for all batches, whatever their trials; on an accelerator, for those of the same length.
+    It is compiled once for all batches; on an accelerator, for those of the same length.
     """
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
@@ -419,13 +408,9 @@ def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
 def _settle(
     plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int, held: int
 ) -> tuple[Any, jax.Array]:
-    """State after driving so that the odometry reports `speeds` (2,), and the command (2,) that does it: where the
-    vehicle falls short of its command, as a skid-steered one does, the command, which is held for a few steps, is
-    raised until it does not.
-
-    Effects on commands have reached what they make of it at once: a lag or a limit that began at rest would last longer
-    than this, and the vehicle would begin its drive with a command on the way from 0.
-    """
+    """State after driving so that the odometry reports `speeds` (2,), and the command (2,) that does it, raised where
+    the vehicle falls short of its command, as a skid-steered one does. Effects on commands have reached what they make
+    of it at once: a lag or limit that began at rest would last longer than this."""
     params = reached(params)
 
     def body(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], None]:

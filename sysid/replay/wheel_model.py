@@ -1,8 +1,7 @@
 """The model of a log without commands: a body on wheels whose speeds were measured.
 
-What such a log determines is how the wheels' turning becomes motion: their radius, their distance, and where the
-tracked point is. Slip along and scrub act as a smaller radius and a larger track, and are part of them. Nothing of the
-drive, its delays or the commands' scale shows.
+Such a log determines the wheels' radius, their distance, and where the tracked point is; slip along and scrub act as a
+smaller radius and a larger track. Nothing of the drive, its delays or the commands' scale shows.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ NOTE = ("the log has no commands: measured wheel speeds are the input. Radius an
 def wheel_model(spec: VehicleSpec) -> Model:
     """The model of a vehicle with measured wheel speeds as its command: v and omega at the nominal radius and track.
 
-    Its parameters are the mean `radius` of the wheels [m], `radius_difference` (right less left, over the mean), the
-    effective `track` [m], the tracked point's place `ahead` and `left` of the point that does not slide sideways [m],
-    and how much older the outside pose is than the wheel speeds [s]. Drivers filter these: where they are 30 ms late,
-    a pose that is 100 ms old shows as 70 ms.
+    Parameters: mean `radius` of the wheels [m], `radius_difference` (right less left, over the mean), effective `track`
+    [m], the tracked point `ahead` and `left` of the point that does not slide sideways [m], and how much older the
+    outside pose is than the wheel speeds [s], which drivers filter: a pose of 100 ms beside speeds of 30 ms shows as 70
+    ms.
     """
     nominal_radius, nominal_track = spec.wheel_radius, spec.track
     reach = max(2 * nominal_track, 0.5)

@@ -11,43 +11,41 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from sysid.replay.stated_drive import ROLLERS, StatedDrive
+
+CASTER = re.compile(r"cast[eo]r|swivel", re.I)
 PASSIVE = re.compile(r"cast[eo]r|swivel|ball|idler|passive|steer|omni|roller|fork|track", re.I)
 """Words in the names of what rolls along, or turns another wheel about the vertical."""
-LEFT = {"left", "l", "fl", "rl", "bl", "ml", "lf", "lr", "lb", "lm", "lh"}
-RIGHT = {"right", "r", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh"}
+STEERING = re.compile(r"steer", re.I)
+LEFT = {"left", "l", "fl", "rl", "bl", "ml", "lf", "lr", "lb", "lm", "lh", "lw", "wl"}
+RIGHT = {"right", "r", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh", "rw", "wr"}
 WHEEL = re.compile(r"wheel|tyre|tire|whl", re.I)
-SIDEWAYS = re.compile(r"mec[ac]num|omni|swedish", re.I)
-"""Words in the names of wheels, their joints and meshes that let a robot drive sideways."""
-MOST = 3  # wheels on each side
 LEVEL = 0.5  # of an axis along the vertical, or less than which it does not lie across
 UPRIGHT = 0.9  # of an axis along the vertical, from which it steers
 SWIVELS = np.radians(300.0)  # range of a hinge from which a caster turns on it
 MANY_TURNS = 200 * np.pi  # rad of a range that is no end
 
 
-def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...]:
+def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDrive) -> tuple[str, ...]:
     """Names of the joints of the driven wheels: those on the left from front to rear, then those on the right.
 
-    Args:
-        path: of the file, for errors.
-        spec: mujoco.MjSpec.
-        wheels: joints or actuators that were named; of two the first is the left one.
-
-    Raises:
-        ValueError: their names do not show them, or they do not stand in pairs.
+    `wheels`: joints or actuators that were named, of two the left one first; `stated`: what the file says of its drive.
+    ValueError where neither the file nor names show them, or they do not stand in pairs.
     """
     hinges = {joint.name: joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name}
     driven = {actuator.name: actuator.target for actuator in spec.actuators}
     if wheels:
         found = [driven.get(name, name) for name in wheels]
-        if len(set(found)) not in (2, 4, 6) or len(found) != len(set(found)) or not set(found) <= set(hinges):
+        if len(set(found)) % 2 or len(found) != len(set(found)) or not set(found) <= set(hinges):
             raise ValueError(f"{path}: wheels are {' and '.join(wheels)}; they must be two hinge joints or "
-                             f"their actuators, left and right, or four or six of a skid-steered robot "
+                             f"their actuators, left and right, or four, six or more of a skid-steered robot "
                              f"(joints: {', '.join(hinges)}; actuators: {', '.join(driven)}).")
         return (found[0], found[1]) if len(found) == 2 else _paired(path, spec, found)
     standing = _standing(spec, hinges)
     if standing is not None:
-        _refuse_steering(path, spec, hinges, standing)
+        _refuse_steering(path, hinges, standing, stated)
+        if (found_sides := _stated_wheels(standing, stated)) is not None:
+            return found_sides
     pulled = [name for name in hinges if name in driven.values()]
     for among in (pulled, list(hinges)):
         sides = [[name for name in among if side in name.lower() and _may_roll(hinges[name])]
@@ -59,7 +57,7 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...
     wheels_alone = [name for name in rolling if name in active]
     level = [name for name in active if standing and name in standing and standing[name].is_wheel]
     for names in ([name for name in pulled if name in rolling], wheels_alone, rolling, level):
-        if len(names) in (2, 4, 6) and standing is not None and (in_order := _by_side(standing, names)) is not None:
+        if names and standing is not None and (in_order := _by_side(standing, names)) is not None:
             return in_order
     axles = [name for name in hinges if standing and standing[name].is_wheel]
     if standing and len(axles) > 2 and len({standing[name].direction for name in axles}) > 1:
@@ -68,12 +66,18 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str]) -> tuple[str, ...
                          "(docs/models.md), or name the wheels that drive with --wheels.")
     if not hinges:
         raise ValueError(f"{path}: no joint turns, so it has no wheels. The joints of wheels are of type continuous in "
-                         "a URDF, hinge in MJCF.")
+                         "a URDF, hinge in MJCF. Tracks that slide along a robot are not read.")
+    if standing is None:
+        spec.copy().compile()  # MuJoCo says where the mistake is
+    if not any(map(_may_roll, hinges.values())):
+        raise ValueError(f"{path}: all joints end within a turn ({', '.join(hinges)}), as on a robot with legs or an "
+                         "arm: it has no wheels. Joints of wheels are of type continuous in a URDF, without a range in "
+                         "MJCF.")
     raise ValueError(f"{path}: the names do not show which wheels are driven (joints: {', '.join(hinges)}). Name "
-                     "them: wheels=(left, right), on the command line --wheels LEFT RIGHT, or all four or six.")
+                     "them: wheels=(left, right), on the command line --wheels LEFT RIGHT, or all four, six or more.")
 
 
-def as_plain_wheels(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
+def as_plain_wheels(path: Path, spec: Any, joints: Sequence[str], stated: StatedDrive) -> list[str]:
     """Let driven wheels turn without an end; notes on ends that are left out, and on wheels that are no plain ones."""
     notes, odd = [], []
     for joint in [one for one in spec.joints if one.name in joints]:
@@ -86,11 +90,14 @@ def as_plain_wheels(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
         rollers = [one for one in body.find_all("joint") if one.name != joint.name
                    and one.type == mujoco.mjtJoint.mjJNT_HINGE]
         named = (joint.name, body.name, *(str(geom.meshname) for geom in body.geoms))
-        if len(rollers) > 2 or any(SIDEWAYS.search(one) for one in named):
+        if (stated.sideways or body.name in stated.rollers or len(rollers) > 2
+                or any(ROLLERS.search(one) for one in named)):
             odd.append(joint.name)
     if odd:
-        notes.append(f"{path.name}: {', '.join(odd)}: mecanum or omni wheels are taken for plain ones. The model does "
-                     "not drive sideways, and turns as a skid-steered robot; fit drives without sideways commands")
+        plugin = f" ({stated.sideways})" if stated.sideways else ""
+        notes.append(f"{path.name}: {', '.join(odd)}{plugin}: mecanum or omni wheels are taken for plain ones. The "
+                     "model does not drive sideways, and turns as a skid-steered robot; fit drives without sideways "
+                     "commands")
     return notes
 
 
@@ -100,8 +107,7 @@ class _Stand:
 
     place: np.ndarray  # (3,) m
     axis: np.ndarray  # (3,)
-    is_wheel: bool
-    """Whether it turns without an end about a level axis across the chassis, and hangs on no other hinge."""
+    is_wheel: bool  # whether it turns without an end about a level axis across the chassis, and hangs on no other hinge
 
     @property
     def direction(self) -> int:
@@ -131,18 +137,33 @@ def _standing(spec: Any, hinges: Mapping[str, Any]) -> dict[str, _Stand] | None:
     return found
 
 
-def _refuse_steering(path: Path, spec: Any, hinges: Mapping[str, Any], standing: Mapping[str, _Stand]) -> None:
+def _stated_wheels(standing: Mapping[str, _Stand], stated: StatedDrive) -> tuple[str, ...] | None:
+    """Joints that the file says are driven, in order; None where it names none, or others than wheels in pairs."""
+    if stated.left and len(stated.left) == len(stated.right) and {*stated.left, *stated.right} <= set(standing):
+        return tuple(name for side in (stated.left, stated.right)
+                     for name in sorted(side, key=lambda one: -standing[one].place[0]))
+    names = [name for name in stated.by_speed if name in standing and standing[name].is_wheel]
+    return _by_side(standing, names) if names else None
+
+
+def _refuse_steering(
+    path: Path, hinges: Mapping[str, Any], standing: Mapping[str, _Stand], stated: StatedDrive
+) -> None:
     """Refuse wheels that are steered: what turns them is not in the file, and held straight they would skid."""
-    steered = {joint.parent.name: name for name, joint in hinges.items()
-               if _has_end(joint) and np.ptp(joint.range) < SWIVELS and abs(float(standing[name].axis[2])) > UPRIGHT}
+    remedy = ("robots that steer as cars and tricycles do are not read. Fit a function of your own (docs/models.md), "
+              "or name the wheels that drive with --wheels to hold the steering straight.")
+    upright = {name: joint for name, joint in hinges.items() if abs(float(standing[name].axis[2])) > UPRIGHT}
+    steered = {joint.parent.name: name for name, joint in upright.items()
+               if _has_end(joint) and np.ptp(joint.range) < SWIVELS
+               or STEERING.search(name) and not CASTER.search(f"{name} {joint.parent.name}")}
     for name, joint in hinges.items():
         above = joint.parent.parent
         while _rolls(joint) and above.name != "world":
             if above.name in steered:
-                raise ValueError(f"{path}: wheel {name} is steered by joint {steered[above.name]}; robots that steer "
-                                 "as cars do are not read. Fit a function of your own (docs/models.md), or name the "
-                                 "wheels that drive with --wheels to hold the steering straight.")
+                raise ValueError(f"{path}: wheel {name} is steered by joint {steered[above.name]}; {remedy}")
             above = above.parent
+    if stated.steering:
+        raise ValueError(f"{path}: its plugin {stated.steering} steers its wheels; {remedy}")
 
 
 def _has_end(joint: Any) -> bool:
@@ -174,18 +195,23 @@ def _by_side(standing: Mapping[str, _Stand], names: Sequence[str]) -> tuple[str,
     ours = [standing[name] for name in names]
     place = np.array([one.place for one in ours])
     across = [abs(float(one.axis[1])) > LEVEL for one in ours]
-    named = all(map(_side, names))
-    if any(abs(float(one.axis[2])) > LEVEL for one in ours) or not (named or all(across)):
+    stated = _sides(names)
+    if any(abs(float(one.axis[2])) > LEVEL for one in ours) or not (all(stated) or all(across)):
         return None
-    sides = [_side(name) or (1 if y > place[:, 1].mean() else -1) for name, y in zip(names, place[:, 1], strict=True)]
-    if len(names) == 2 and not named and abs(place[0, 1] - place[1, 1]) < np.abs(place[0] - place[1]).max():
+    sides = [one or (1 if y > place[:, 1].mean() else -1) for one, y in zip(stated, place[:, 1], strict=True)]
+    if len(names) == 2 and not all(stated) and abs(place[0, 1] - place[1, 1]) < np.abs(place[0] - place[1]).max():
         return None  # one behind the other
     order = sorted(range(len(names)), key=lambda i: (-sides[i], -place[i, 0]))
-    return tuple(names[i] for i in order) if sum(sides) == 0 and len(names) // 2 <= MOST else None
+    return tuple(names[i] for i in order) if sum(sides) == 0 else None
 
 
-def _side(name: str) -> int:
-    """1 for a name of the left, -1 of the right, 0 of neither."""
-    words = {word for word in re.split(r"[^a-z]+", name.lower()) if word}
-    words |= {side for side in ("left", "right") if side in name.lower()}
-    return bool(words & LEFT) - bool(words & RIGHT)
+def _sides(names: Sequence[str]) -> list[int]:
+    """1 for a name of the left, -1 of the right, 0 of neither; what all names share, as a robot's own, says nothing."""
+    words = [{word for word in re.split(r"[^a-z0-9]+", name.lower()) if word} for name in names]
+    shared = set.intersection(*words) if len(words) > 1 else set()
+    found = []
+    for name, mine in zip(names, words, strict=True):
+        parts = {part for word in mine - shared for part in re.split(r"[^a-z]+", word) if part}
+        parts |= {side for side in ("left", "right") if side in name.lower()}
+        found.append(bool(parts & LEFT) - bool(parts & RIGHT))
+    return found

@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-LEFT_OUT = "left out: "
-"""Begins a line of what was left out."""
+LEFT_OUT = "left out: "  # begins a line of what was left out
 PARENTS = 4  # folders above the file in which packages are looked for
 SECONDS, BYTES = 10, 1_500_000_000  # processor time and memory; an arm with all its macros takes a second
 

@@ -24,8 +24,7 @@ from sysid.search.studies import BATCH
 from sysid.search.valleys import gradient_search
 
 METHODS = ("features", "lm", "both", "tpe", "cmaes")
-NEAR = 0.05
-"""A search has arrived when its cost is within this share of the best one that any of them found."""
+NEAR = 0.05  # A search has arrived when its cost is within this share of the best one that any of them found
 
 
 class Recorder:

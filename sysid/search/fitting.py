@@ -13,97 +13,65 @@ import numpy as np
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
 from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, Replays, estimate_noise
 from sysid.errors.prior import Prior, bounds_alone, make_prior
-from sysid.errors.robust import robust_cost
-from sysid.errors.space import Space, make_space, searched
+from sysid.errors.space import Space, make_space, robust_cost, searched
 from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Minimum, Profile, check_names, profile
 from sysid.logs import odometry_frames
 from sysid.logs.log import of_file
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.logs.sources import refuse_recording
+from sysid.replay import models
 from sysid.replay.differences import make_replay
 from sysid.replay.model_files import load_model
-from sysid.replay.models import (
-    Model,
-    calibrated,
-    calibration_effects,
-    describe_parameters,
-    get_parameters,
-    gyro_effects,
-    measured_effects,
-    model_space,
-    set_parameters,
-    with_effects,
-)
+from sysid.replay.models import Model
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
 from sysid.replay.wheel_model import wheel_model
-from sysid.search import least_squares, slopes, starts, thin, tpe
+from sysid.search import least_squares, settings, slopes, starts, thin, tpe
 from sysid.search.result import FitResult, Progress, Stages
-from sysid.search.settings import (
-    FEATURE_ITERATIONS,
-    GLOBAL,
-    QUICK_EVALUATIONS,
-    QUICK_ITERATIONS,
-    QUICK_TRIALS,
-    TOGETHER,
-    TRIED,
-    FitConfig,
-)
+from sysid.search.settings import FitConfig
 from sysid.search.stated import chosen_sizes
 from sysid.search.studies import StudyPlace
 from sysid.search.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
-from whill_mjx.vehicle.specs import VehicleSpec
 
 
 @dataclass(frozen=True)
 class Fit:
     """A fitted vehicle and what is known of it."""
 
-    params: Any
-    """`VehicleParams` at the fitted values."""
+    params: Any  # `VehicleParams` at the fitted values
     initial_params: Any
     space: Space
     uncertainty: uncertainty.Uncertainty
     noise: Noise
-    scan: FitResult | None
-    """Result of the global search."""
-    coarse: FitResult | None
-    """Result of the search on features, of all its starts."""
-    search: FitResult | None
-    """Result of the gradient search."""
+    scan: FitResult | None  # result of the global search
+    coarse: FitResult | None  # result of the search on features, of all its starts
+    search: FitResult | None  # result of the gradient search
     u: np.ndarray  # (P,) fitted unit coordinates
     initial_cost: float
-    cost: float
-    """Mean squared white residual (large ones counted linearly); J in metres after a global search."""
+    cost: float  # mean squared white residual (large ones counted linearly); J in metres after a global search
     profiles: list[tuple[str, np.ndarray, np.ndarray]]
     seconds: float
     plant: Plant
-    prior: Prior | None = None
-    """Of an earlier vehicle file."""
-    model: Model | None = None
-    """What was fitted in place of the simulator's vehicle."""
-    likelihoods: tuple[Profile, ...] = ()
-    """Profile likelihoods of the parameters that `profile` names."""
+    prior: Prior | None = None  # of an earlier vehicle file
+    model: Model | None = None  # what was fitted in place of the simulator's vehicle
+    likelihoods: tuple[Profile, ...] = ()  # profile likelihoods of the parameters that `profile` names
     frame: float | None = None
     """Time between the frames of the odometry [s] (`sysid.logs.odometry_frames`), where they show."""
-    stated: tuple[str, ...] = ()
-    """Groups of sizes that keep their stated values (`sysid.search.stated`)."""
-    replay: Replays | None = None
-    """Of the training trials; what it has compiled serves other trials too."""
+    stated: tuple[str, ...] = ()  # groups of sizes that keep their stated values (`sysid.search.stated`)
+    replay: Replays | None = None  # of the training trials; what it has compiled serves other trials too
 
 
 def fit_log(
     log: Log, config: FitConfig | None = None, progress: Progress | None = None, params: Any = None,
     model: Model | None = None,
 ) -> Fit:
-    """Fit the training trials of a log.
+    """Fit the training trials of a log; its held-out trials are not looked at.
 
     Args:
-        log: its held-out trials are not looked at.
         params: where the search starts; by default the preset's values for the log's vehicle.
         model: what is fitted in place of the simulator's vehicle; by default what `config.model` names.
     """
@@ -116,16 +84,16 @@ def fit_log(
         config = replace(config, elsewhere=False)
     space, objective = given.space, given.objective
     wanted = profiled(space, config)
-    iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
-    stages = Stages(progress, 1 if config.method in GLOBAL else 3 if config.method == "lm" else 4)
+    iterations = min(config.iterations, settings.QUICK_ITERATIONS) if config.quick else config.iterations
+    stages = Stages(progress, 1 if config.method in settings.GLOBAL else 3 if config.method == "lm" else 4)
     scan, coarse, points = _first_points(log, given, config, stages)
     if config.vehicle is not None:
         objective = replace(objective, prior=make_prior(space, given.intervals, config.spread))
     chosen: DriveResiduals = choose(objective, points[0], log.spec.track, config, stages)
-    robust, search = config.robust and config.method not in GLOBAL, None
+    robust, search = config.robust and config.method not in settings.GLOBAL, None
     stated: tuple[str, ...] = ()
     profiles: list[tuple[str, np.ndarray, np.ndarray]] = []
-    if config.method in GLOBAL:
+    if config.method in settings.GLOBAL:
         assert scan is not None
         u, initial_cost, final_cost = scan.u, scan.initial_cost, scan.cost
     else:
@@ -135,7 +103,7 @@ def fit_log(
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
     known = uncertainty.estimate(chosen, u, robust=robust)
     traced = profile(chosen, Minimum(u, known, config.robust), wanted, progress=progress) if wanted else []
-    if config.calibrate and not config.all_sizes and config.vehicle is None and config.method not in GLOBAL:
+    if config.calibrate and not config.all_sizes and config.vehicle is None and config.method not in settings.GLOBAL:
         if progress is not None:
             progress(0, "sizes: stated or free")
         sizes = chosen_sizes(chosen, objective.renewed(u), known, final_cost, config.parameters, robust)
@@ -144,7 +112,7 @@ def fit_log(
         known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space) if stated else known
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
-    fitted = set_parameters(given.params, space.names, values)
+    fitted = models.set_parameters(given.params, space.names, values)
     earlier = chosen.prior if config.vehicle is not None else None
     return Fit(fitted, given.params, space, known, objective.noise, scan, coarse, search, u, initial_cost, final_cost,
                profiles, time.perf_counter() - began, given.plant, earlier, given.model, tuple(traced), given.frame,
@@ -154,13 +122,12 @@ def fit_log(
 def _first_points(
     log: Log, given: Problem, config: FitConfig, stages: Stages
 ) -> tuple[FitResult | None, FitResult | None, np.ndarray]:
-    """Results of the global search and of the one on features, as far as the method has them, and the points (S, P)
-    from which the gradient search starts."""
+    """Results of the global search and of that on features, where there is one, and points (S, P) for LM."""
     space, objective = given.space, given.objective
     points = least_squares.random_starts(space, config.starts, config.seed)
-    if config.method in (*GLOBAL, "both"):
-        evaluations = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
-        cost = "paper" if config.method in GLOBAL else "weighted"
+    if config.method in (*settings.GLOBAL, "both"):
+        evaluations = min(config.trials, settings.QUICK_EVALUATIONS) if config.quick else config.trials
+        cost = "paper" if config.method in settings.GLOBAL else "weighted"
         count = max(min(config.starts, 2) if config.quick else config.starts, 2)
         problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in objective.trials),
                    "channels": config.channels, "model": config.preset if given.model is None else given.model.name,
@@ -174,7 +141,7 @@ def _first_points(
         first = stages.begin("features of motion")
         starts.compile_ahead(objective, log.spec.track)
         points = starts.draw(objective, range(config.starts), log.spec.track, config.seed, progress=first)
-        coarse = starts.fit(objective, points, log.spec.track, FEATURE_ITERATIONS, first)
+        coarse = starts.fit(objective, points, log.spec.track, settings.FEATURE_ITERATIONS, first)
         return None, coarse, coarse.u[None]
     return None, None, points
 
@@ -184,21 +151,17 @@ def choose(
 ) -> DriveResiduals:
     """Choose the last objective of a search, whole poses or motion in bins, with the weight of its prior.
 
-    Least squares of whole poses are efficient where only the sensors err, independently in each sample. Disturbances
-    add up along a drive, so the errors of poses are correlated: motion in bins then holds more information.
-
-    Args:
-        u: (P,) where the search begins, or where that on features ended; a few steps on poses lead on from there.
-        track: of the vehicle [m].
+    Least squares of whole poses are efficient where only the sensors err. Disturbances add up along a drive: motion in
+    bins then holds more information. `u`: (P,) where the search begins or that on features ended; `track` in m.
     """
-    if config.method in GLOBAL:
+    if config.method in settings.GLOBAL:
         return objective
     progress = stages.begin("whole poses") if stages else None
-    near = least_squares.fit(objective, starts=u[None], stop=least_squares.Stopping(TRIED), robust=config.robust,
-                             progress=progress)
+    near = least_squares.fit(objective, starts=u[None], stop=least_squares.Stopping(settings.TRIED),
+                             robust=config.robust, progress=progress)
     share = uncertainty.inflation(objective, near.u)
     chosen: Objective | FeatureObjective = objective
-    if config.method == "features" and share >= TOGETHER:
+    if config.method == "features" and share >= settings.TOGETHER:
         binned = make_features_objective(objective, track)
         if binned.enough:
             chosen = binned.renewed(u)
@@ -211,23 +174,19 @@ class Problem:
     """What a search is given."""
 
     plant: Plant
-    params: Any
-    """Where it starts."""
+    params: Any  # where it starts
     space: Space
-    objective: Objective
-    """Over the training trials."""
-    intervals: dict[str, tuple[float, float]]
-    """Of an earlier vehicle file."""
+    objective: Objective  # over the training trials
+    intervals: dict[str, tuple[float, float]]  # of an earlier vehicle file
     model: Model | None
-    frame: float | None = None
-    """Time between the frames of the odometry [s], which the trials' rows are at."""
+    frame: float | None = None  # time between the frames of the odometry [s], which the trials' rows are at
 
 
 def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model | None = None) -> Problem:
     """The search for a log's vehicle or model; arguments and errors as of `fit_log`."""
     trials = _training(log, config)
-    if config.quick and len(trials) > QUICK_TRIALS:
-        trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, QUICK_TRIALS).round().astype(int))
+    if config.quick and len(trials) > settings.QUICK_TRIALS:
+        trials = tuple(trials[i] for i in np.linspace(0, len(trials) - 1, settings.QUICK_TRIALS).round().astype(int))
     frame = odometry_frames.find_period(trials)
     trials = odometry_frames.at_frames(trials, frame)
     model, plant, params, space, intervals = _subject(log, config, trials, params, model)
@@ -260,8 +219,8 @@ def _training(log: Log, config: FitConfig) -> tuple[Trial, ...]:
 def _subject(
     log: Log, config: FitConfig, trials: tuple[Trial, ...], params: Any = None, model: Model | None = None
 ) -> tuple[Model | None, Plant, Any, Space, dict[str, tuple[float, float]]]:
-    """What is fitted: the model where it is not the simulator's vehicle, its plant, where the search starts, the
-    parameters that are free, and intervals of an earlier vehicle file."""
+    """The model where it is not the simulator's vehicle, its plant, where the search starts, the free parameters, and
+    intervals of an earlier vehicle file."""
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
@@ -272,12 +231,12 @@ def _subject(
             raise ValueError(f"{config.vehicle}: a vehicle file says nothing about the model {model.name!r}. Leave "
                              "--vehicle or --model out.")
         alone: tuple[str, ...] = ()
-        model = model.with_effects((*config.effects, *gyro_effects(trials)))
+        model = model.with_effects((*config.effects, *models.gyro_effects(trials)))
         if config.calibrate and not config.parameters:
-            model, alone = calibrated(model, trials)
+            model, alone = models.calibrated(model, trials)
         plant, params = model.plant, model.params if params is None else params
-        wanted = [name for name in describe_parameters(params) if name not in alone]
-        space = model_space(params, config.parameters or wanted)
+        wanted = [name for name in models.describe_parameters(params) if name not in alone]
+        space = models.model_space(params, config.parameters or wanted)
         if not config.calibrate or not any(trial.ground_truth is not None for trial in trials):
             why = "no outside pose shows it" if config.calibrate else "not selected"
             for name in [one for one in space.names if one.startswith("wheels.") and one not in config.parameters]:
@@ -289,9 +248,9 @@ def _subject(
             params, intervals = _earlier(config.vehicle)
         params = preset_params(log.spec, config.preset) if params is None else params
         receipt = log.fields.get("pose_stamps") == "receipt"
-        measured = () if given else measured_effects(params, log.spec, trials, receipt=receipt)
-        sizes = calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
-        params = with_effects(params, (*config.effects, *measured, *sizes, *gyro_effects(trials)))
+        measured = () if given else models.measured_effects(params, log.spec, trials, receipt=receipt)
+        sizes = models.calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
+        params = models.with_effects(params, (*config.effects, *measured, *sizes, *models.gyro_effects(trials)))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
     if model is None or model.around:  # else a person chose what is fitted
         space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
@@ -302,7 +261,7 @@ def profiled(space: Space, config: FitConfig) -> tuple[str, ...]:
     """Parameters whose profile is wanted; ValueError where there can be none."""
     wanted = tuple(space.names) if config.profile == ("all",) else config.profile
     check_names(space, wanted)
-    if wanted and config.method in GLOBAL:
+    if wanted and config.method in settings.GLOBAL:
         raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
                          "profile starts from. Use --method features, lm or both.")
     return wanted
@@ -331,18 +290,13 @@ def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial,
     return Objective(replay, space, trials, measured, noise)
 
 
-def fitted_plant(spec: VehicleSpec) -> Plant:
-    """The simulator's vehicle with the physics step that fits have by default: for logs with planted truth, since the
-    step is part of a model."""
-    return vehicle_plant(spec, VehicleConfig(physics_dt=FitConfig.physics_dt))
-
-
 def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list[Prediction]]:
     """Replays of trials with the initial and with the fitted vehicle."""
     if not trials:
         return [], []
     replay, _ = make_replay(fit.plant, fit.params, fit.space, trials, fit.replay)
-    values = np.stack([np.asarray(get_parameters(one, fit.space.names)) for one in (fit.initial_params, fit.params)])
+    values = np.stack([np.asarray(models.get_parameters(one, fit.space.names))
+                       for one in (fit.initial_params, fit.params)])
     simulated = replay.simulate(values)
     initial, fitted = (predictions(trials, jax.tree.map(lambda leaf, i=i: leaf[i], simulated)) for i in (0, 1))
     return initial, fitted
@@ -358,9 +312,9 @@ def _keep_channels(trial: Trial, channels: str) -> Trial:
 
 def expected_steps(config: FitConfig) -> int:
     """How far the progress bar goes, unless searches from elsewhere lead on."""
-    scan = min(config.trials, QUICK_EVALUATIONS) if config.quick else config.trials
-    iterations = min(config.iterations, QUICK_ITERATIONS) if config.quick else config.iterations
+    scan = min(config.trials, settings.QUICK_EVALUATIONS) if config.quick else config.trials
+    iterations = min(config.iterations, settings.QUICK_ITERATIONS) if config.quick else config.iterations
     drawn = starts.FIRST + starts.STEPS if config.starts > 1 else 0
-    first = {"features": drawn + FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
+    first = {"features": drawn + settings.FEATURE_ITERATIONS * 3 // 2, "lm": 0}.get(config.method, scan)
     elsewhere = FIRST + 5 * min(LOOK, iterations) + slopes.MISSES if config.elsewhere else 0
-    return first + (TRIED + iterations + elsewhere if config.method not in GLOBAL else 0)
+    return first + (settings.TRIED + iterations + elsewhere if config.method not in settings.GLOBAL else 0)

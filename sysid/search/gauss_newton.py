@@ -14,8 +14,7 @@ AT_WALL = 1e-6
 def normal_sums(
     residual: np.ndarray, jacobian: np.ndarray, weight: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Half the gradients (N, P) and half the Gauss-Newton Hessians (N, P, P) of weighted squares of residuals (N, ...)
-    with the derivatives (N, ..., P)."""
+    """Half the gradients (N, P) and Gauss-Newton Hessians (N, P, P) of weighted squares of residuals (N, ...)."""
     axes, residual = "abcd"[: jacobian.ndim - 2], residual.reshape(jacobian.shape[:-1])
     pulls, columns = (residual, jacobian) if weight is None else (residual * weight, jacobian * weight[..., None])
     return (np.einsum(f"n{axes}p,n{axes}->np", jacobian, pulls),
@@ -32,28 +31,18 @@ class BoxStep:
 
     low: Any = 0.0  # (P,), or one for all
     high: Any = 1.0
-    reach: Any = 0.3
-    """Largest step, or a function that gives it (N, P) at u (N, P)."""
-    free: Any = True
-    """(P,) or (N, P): False for parameters that keep their value."""
+    reach: Any = 0.3  # largest step, or a function that gives it (N, P) at u (N, P)
+    free: Any = True  # (P,) or (N, P): False for parameters that keep their value
     move: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.add
     """Where a step (N, P) from u (N, P) leads (`Space.moved`)."""
     passes: int = 3
     """Solutions at most, each with more parameters held: cutting one at its wall may lead another to its own."""
-    adapt: bool = False
-    """Hold whatever is cut, by its reach too, at the cut step; otherwise only what begins at a wall."""
-    floor: float = 1e-6
-    """Damping of parameters that do nothing, as a share of the largest curvature."""
-    ridge: float = 0.0
-    """Share of the largest curvature that is added whatever the damping."""
+    adapt: bool = False  # hold whatever is cut, by its reach too, at the cut step; otherwise only what begins at a wall
+    floor: float = 1e-6  # damping of parameters that do nothing, as a share of the largest curvature
+    ridge: float = 0.0  # share of the largest curvature that is added whatever the damping
 
     def points(self, u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: Any) -> np.ndarray:
-        """The points (N, P) to which steps from u (N, P) lead.
-
-        Args:
-            gradient, hessian: by half, (N, P) and (N, P, P); without N where they are the same for all.
-            damping: (N,), or one for all.
-        """
+        """The points (N, P) to which steps from u (N, P) lead, by half gradients (N, P) and Hessians (N, P, P)."""
         count, size = u.shape
         reach = self.reach(u) if callable(self.reach) else self.reach
         gradient, low, high, reach, free = (
@@ -89,30 +78,22 @@ class BoxStep:
 class Try(NamedTuple):
     """One of the points that are tried in a step."""
 
-    factor: float
-    """On the damping of the start."""
-    share: float = 1.0
-    """Of the step."""
-    easing: float | None = None
-    """Factor on the damping after the try was the best; None takes `factor`."""
+    factor: float  # on the damping of the start
+    share: float = 1.0  # of the step
+    easing: float | None = None  # factor on the damping after the try was the best; None takes `factor`
 
 
 @dataclass(frozen=True)
 class Patience:
     """When a start is at its minimum."""
 
-    tolerance: float
-    """A gain below this share of the cost is small."""
-    times: int = 1
-    """Small gains that end the search, and none in between of `anew` tolerances or more."""
+    tolerance: float  # A gain below this share of the cost is small
+    times: int = 1  # small gains that end the search, and none in between of `anew` tolerances or more
     anew: float = 1.0
-    noise: float = 0.0
-    """What no step takes away of the cost: gains are compared with the rest, or with `least`."""
+    noise: float = 0.0  # what no step takes away of the cost: gains are compared with the rest, or with `least`
     least: float = 0.0
-    failures: bool = False
-    """Whether a step that gains nothing counts as a small gain."""
-    first: int = 0
-    """Steps before a small gain counts."""
+    failures: bool = False  # whether a step that gains nothing counts as a small gain
+    first: int = 0  # steps before a small gain counts
 
     def scale(self, cost: np.ndarray) -> np.ndarray:
         """Gains below this are small."""
@@ -163,15 +144,11 @@ class GaussNewton:
     box: BoxStep
     choices: tuple[Try, ...]
     patience: Patience
-    prior: tuple[np.ndarray, np.ndarray] | None = None
-    """Mean m (P,) and precision L (P, P)."""
-    damping: float = 1e-2
-    """At first."""
+    prior: tuple[np.ndarray, np.ndarray] | None = None  # mean m (P,) and precision L (P, P)
+    damping: float = 1e-2  # at first
     least: float = 1e-7
-    most: float = 1e4
-    """A start is at its minimum when a step with this damping gains nothing."""
-    stiffer: float = 100.0
-    """Factor on the damping after a step that gained nothing."""
+    most: float = 1e4  # A start is at its minimum when a step with this damping gains nothing
+    stiffer: float = 100.0  # factor on the damping after a step that gained nothing
 
     def init(self, u: np.ndarray) -> State:
         """Starts u (S, P) whose cost is unknown."""
@@ -207,12 +184,9 @@ class GaussNewton:
         return Tried(points.reshape(count, -1, size), fall.reshape(count, -1) * shares * (2 - shares))
 
     def step(self, state: State, tried: Tried, costs: np.ndarray, exact: Any = True) -> State:
-        """Move to the best of the points, where it costs less.
+        """Move to the best of the points, by their costs (S, D), where it costs less.
 
-        Args:
-            costs: (S, D) of the points.
-            exact: (S,), or one for all: False where the derivatives were not those of the very point, so that failing
-                says nothing.
+        `exact`: False where derivatives were not those of the very point, so that failing says nothing.
         """
         best, rows = np.nanargmin(costs, axis=-1), np.arange(len(costs))
         fallen, easings = state.cost - costs[rows, best], np.array([

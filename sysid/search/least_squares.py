@@ -1,9 +1,8 @@
 """Bounded Levenberg-Marquardt from several starts at once.
 
-All starts advance together: each iteration is one batched Jacobian and one batched replay of several damping values per
-start, of which the best is taken; starts that have converged wait. A Jacobian takes two replays for each parameter, so
-a few more tries follow without a new one: shorter steps where none helped, and where one brought what it promised,
-steps that learn what they can of the derivatives from those before (Broyden 1965). Steps are in unit coordinates.
+Each iteration is one batched Jacobian and one batched replay of several dampings per start; starts that have converged
+wait. A Jacobian takes two replays for each parameter, so a few more tries follow without a new one: shorter steps where
+none helped, else steps that learn what they can of the derivatives (Broyden 1965). Steps are in unit coordinates.
 """
 
 from __future__ import annotations
@@ -15,14 +14,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import Residuals, Space, is_delay
+from sysid.errors.space import Residuals, Space, huber_weight, is_delay, robust_cost
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try, normal_sums
 from sysid.search.result import FitResult, Progress
 from whill_mjx.io.steps import step
 
-DAMPINGS = (0.1, 1.0, 10.0, 1000.0)
-"""Factors on each start's damping that are tried in one iteration."""
+DAMPINGS = (0.1, 1.0, 10.0, 1000.0)  # factors on each start's damping that are tried in one iteration
 MANY_DAMPINGS = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
 """The same on an accelerator, where more tries take no longer, and a second call as long as the first."""
 GRID, APART = 6, 0.1  # points over a range, of which those so far away may lie in another valley
@@ -47,8 +44,7 @@ class Sums(Protocol):
 class Stopping:
     """When a search ends."""
 
-    iterations: int = 30
-    """At most."""
+    iterations: int = 30  # at most
     tolerance: float = 1e-4
     """A start has converged when its cost fell by less than this share twice, and not by GOES_ON times as much in
     between: where wheels skid or torques meet their limit, costs are jagged."""
@@ -60,11 +56,8 @@ def fit(
 ) -> FitResult:
     """Minimise the weighted least squares over the space of an objective.
 
-    Args:
-        objective: residuals and Jacobians in unit coordinates of its space.
-        starts: (S, P) unit coordinates; the initial values by default.
-        robust: Huber instead of squares.
-        frozen: names that keep each start's value.
+    `starts`: (S, P) unit coordinates, by default the initial values; `robust`: Huber; `frozen`: names that keep each
+    start's value.
     """
     space = objective.space
     box = BoxStep(free=np.array([name not in frozen for name in space.names]), move=space.moved)
@@ -176,10 +169,8 @@ def _along_ranges(u: np.ndarray, values: Sequence[float]) -> tuple[np.ndarray, n
 def far_points(objective: Residuals, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Costs (E,) and points (E, P) where one parameter each is far from what it is in u (P,), the promising first.
 
-    Of a grid over the range of each parameter the best point below and the best above, the others following by one
-    damped Gauss-Newton step. Points that cost what u does are left out: a search from there comes back to where it was.
-    What lies behind such level ground comes first, since no derivative shows it: a limit that was never met, say.
-    The rest is in the order of its costs.
+    Of a grid over each range the best point below and above, the others following by one damped Gauss-Newton step.
+    Points that cost what u does are left out. What lies behind such level ground comes first: no derivative shows it.
     """
     points, held = _along_ranges(u, np.linspace(0.0, 1.0, GRID).tolist())
     sides = 2 * held + (points > u).any(1)
@@ -212,8 +203,8 @@ class _Tangent:
 
     def followed(self, objective: Residuals, points: np.ndarray, held: np.ndarray, robust: bool
                  ) -> tuple[np.ndarray, np.ndarray]:
-        """Costs (E,) and points (E, P) after a damped Gauss-Newton step of all but the `held` (E,) parameter of each,
-        where that step is better than none."""
+        """Costs (E,) and points (E, P) after a Gauss-Newton step of all but the `held` (E,) parameter, if it is better.
+        """
         residual = objective.residuals(points)
         weight = huber_weight(residual) if robust else np.ones_like(residual)
         pulls = np.einsum("bkp,nbk->np", self.jacobian, residual * weight, optimize=True)
@@ -227,13 +218,10 @@ class _Tangent:
 def profile_delays(
     objective: Residuals, u: np.ndarray, robust: bool = False
 ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Cost over a grid of each delay-type parameter, the others following it from u (P,).
+    """Name, grid (G,) [s], costs (G,) and points (G, P) of each delay, the others following from u (P,).
 
     A delay acts in steps of the controller's clock, so a search finds the valley that it starts in. The others follow
     by one damped Gauss-Newton step, which shows whether another valley is as deep.
-
-    Returns:
-        Per delay its name, the grid (G,) of its values [s], the costs (G,) and the points (G, P) where they hold.
     """
     profiles, space = [], objective.space
     delays = [index for index, name in enumerate(space.names) if is_delay(name)]

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-Progress = Callable[[int, str], None]
-"""Called with the number of evaluations just done and a short remark."""
+Progress = Callable[[int, str], None]  # called with the number of evaluations just done and a short remark
 
 
 class Stages:
@@ -34,13 +33,11 @@ class FitResult:
 
     u: np.ndarray  # (P,)
     cost: float
-    initial_cost: float
-    """Cost of the first candidate, the initial values."""
+    initial_cost: float  # cost of the first candidate, the initial values
     evaluations: int
     starts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """(S, P) end points of the search: the best candidates of TPE, the end of each start of LM."""
-    start_costs: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """(S,) cost of each of them, where known."""
+    start_costs: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (S,) cost of each of them, where known
     order: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """(S,) which of the given starts each of them comes from, in a gradient search."""
     history: np.ndarray = field(default_factory=lambda: np.zeros(0))

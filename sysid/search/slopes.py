@@ -1,12 +1,9 @@
 """Slopes of residuals over the range that estimates err in.
 
 Wheels stick or slip, torques meet their limit and delays act in steps: the floor of a cost is jagged, and its slopes
-depend on how far they look. Differences over a fixed share of each parameter's range (`sysid.replay.differences`)
-lead there from afar, but one at a time, over many times what a delay errs by and hardly what a sag does: on the floor a
-search by them stops at one of many folds, and they determine some parameters half, others twice as well as the log
-does. What counts is how residuals differ over all likely values: a plane through them at points drawn from the
-ellipsoid of the errors has those slopes (statistical linearisation; Gelb, 1974, chapter 6), and the ellipsoid comes
-from the slopes.
+depend on how far they look. Differences over a fixed share of a range lead there from afar, and then determine some
+parameters half, others twice as well as the log does. A plane through residuals at points of the ellipsoid of the
+errors has the slopes that count (statistical linearisation; Gelb, 1974, chapter 6).
 """
 
 from __future__ import annotations
@@ -16,23 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors.robust import huber_weight, robust_cost
-from sysid.errors.space import Residuals
+from sysid.errors.space import Residuals, huber_weight, robust_cost
 from sysid.search.gauss_newton import BoxStep, normal_sums
 from sysid.search.result import FitResult, Progress
 from whill_mjx.io.steps import step
 
-ROTATIONS = 3
-"""Of the ellipsoid's axes, at random: each has points at both ends of all P axes."""
+ROTATIONS = 3  # of the ellipsoid's axes, at random: each has points at both ends of all P axes
 AT_ONCE = 2**23  # residuals, of points that are replayed together
 REFLECTIONS = 8  # passes over the walls of the box; what is outside still then is moved inwards
-REACH = 0.08
-"""Largest standard deviation of the points, in unit coordinates: further away lie other valleys."""
-EXACT = 1e-9
-"""Least cost, in squared noise scales: a model that fits to the last bit still has an ellipsoid."""
+REACH = 0.08  # largest standard deviation of the points, in unit coordinates: further away lie other valleys
+EXACT = 1e-9  # least cost, in squared noise scales: a model that fits to the last bit still has an ellipsoid
 ROUNDS, MISSES, WORTH = 24, 3, 2e-4
-"""Maximum rounds of a descent; patience; and the share of the cost that a round must gain to count, unless it lowers
-the sum of squares by one. With stricter limits estimates would move by a small share of their errors."""
+"""Maximum rounds of a descent; patience; the share of the cost that a round must gain unless squares fall by one."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
 SIZES = (1.0, 0.3)
 """Of the ellipsoid, in turn: its own size, and one within which the parameters that move little act linearly."""
@@ -41,11 +33,8 @@ SIZES = (1.0, 0.3)
 def average_slopes(
     objective: Residuals, u: np.ndarray, covariance: np.ndarray, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (B, K) at u (P,), and their derivatives (B, K, P) averaged over errors of that covariance (P, P).
-
-    Args:
-        u: unit coordinates; points beyond their range are reflected into it.
-    """
+    """Residuals (B, K) at u (P,), and their derivatives (B, K, P) averaged over errors of that covariance (P, P),
+    reflected into the range."""
     size, random = len(u), np.random.default_rng(seed)
     axes = np.concatenate([np.linalg.qr(random.standard_normal((size, size)))[0] for _ in range(ROTATIONS)])
     steps = np.sqrt(size) * axes @ _root(covariance).T  # as far out as errors are on average
@@ -70,11 +59,8 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 
 
 def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Moves (N, P) from u (P,) that stay in the unit box.
-
-    A wall reflects a move beyond it to the point that is as likely in the ellipsoid of the covariance: parameters that
-    are correlated with the reflected one turn back with it.
-    """
+    """Moves (N, P) from u (P,) that stay in the unit box: a wall reflects a move to the point that is as likely in the
+    ellipsoid of the covariance, correlated parameters with it."""
     moves = moves.copy()
     for _ in range(REFLECTIONS):
         for p in range(len(u)):

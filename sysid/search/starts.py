@@ -1,9 +1,8 @@
 """Where the search starts: the vehicle fitted to its motion in short bins, with noise that has no memory.
 
-A pose adds up all motion before it, so that far from the truth its error has folds in which a search stays. The motion
-within a bin of a quarter of a second has not. Searches from random points within the full bounds of the physical model
-still end in valleys of a wrong delay or torque limit: a start is therefore the best end of searches from the best of
-many random points.
+A pose adds up all motion before it: far from the truth its error has folds in which a search stays; that of short bins
+has not. Searches still end in valleys of a wrong delay or torque limit: a start is the best end of searches from the
+best of many random points.
 """
 
 from __future__ import annotations
@@ -22,29 +21,21 @@ from sysid.search.result import FitResult, Progress
 SCAN = 256
 """Random points that are replayed for one start; a search from a random point itself ends in the nearest valley."""
 KEPT, FIRST = 8, 3
-"""The best of them, and the iterations of a search from each: two of eight lead to the deepest valley, and their costs
-do not show which; what a few iterations bring nearly does."""
-FOLLOWED, STEPS = 2, 20
-"""How many of those are searched further, and in how many iterations at most."""
+"""The best of them, and iterations from each: two of eight lead to the deepest valley, a few nearly show which."""
+FOLLOWED, STEPS = 2, 20  # how many of those are searched further, and in how many iterations at most
 EDGE = 0.02  # of the range, at both ends, without random points
 CHUNK = 512  # points whose residuals are kept at once
-AGREE = 0.02
-"""Starts agree where their costs differ by no more than this share of the best one."""
+AGREE = 0.02  # starts agree where their costs differ by no more than this share of the best one
 TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
 
 
 def fit(
     objective: Objective, points: np.ndarray, track: float, iterations: int = 15, progress: Progress | None = None
 ) -> FitResult:
-    """Fit features from all starts, then from the best one with the noise that it leaves.
+    """Fit features from all starts, unit coordinates (S, P), then from the best one with the noise that it leaves.
 
-    Args:
-        objective: that of the poses; its replay is used.
-        points: (S, P) unit coordinates of the starts.
-        track: of the vehicle [m].
-
-    Returns:
-        The best point; `start_costs` are those of the first fit, ascending.
+    The result is the best point; `start_costs` are those of the first fit, ascending. The replay is the poses'
+    `objective`'s.
     """
     coarse = make_features_objective(objective, track).quicker
     found = least_squares.fit(coarse, starts=points, stop=least_squares.Stopping(iterations, TOLERANCE),
@@ -63,12 +54,7 @@ def draw(
 ) -> np.ndarray:
     """Starts (S, P) of a search: number 0 has the initial values, any other the best of `scan` random points.
 
-    A start is the same whichever others are drawn with it.
-
-    Args:
-        objective: that of the poses; its replay is used.
-        numbers: of the starts.
-        track: of the vehicle [m].
+    A start is the same whichever others are drawn with it. The replay is the poses' `objective`'s; `track` in m.
     """
     space = objective.space
     first = space.to_unit(space.initial)

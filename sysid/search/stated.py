@@ -1,10 +1,9 @@
 """Sizes that need not be freed: drives that are held back are foretold as well with what data sheet and rulers say.
 
-A first calibration frees sizes of the wheels, scales of the odometry and the tracked point. Few drives determine them
-only together with slip, scrub and lags, so that freeing what was right makes other drives worse. Groups that all drives
-contradict are free. The others are judged by what counts in the end: how far whole drives are off that the fit has not
-seen. Each manoeuvre of the training drives is held back in turn, all other parameters follow the rest of the drives,
-and the groups stay free that those which were held back need. Source: Stone (1974), cross-validatory choice.
+Few drives determine sizes of wheels, scales of the odometry and the tracked point only together with slip, scrub and
+lags: freeing what was right makes other drives worse. Groups that all drives contradict are free. Others stay free
+where they make whole drives better that were held back, each manoeuvre in turn, all other parameters following the
+rest. Source: Stone (1974), cross-validatory choice.
 """
 
 from __future__ import annotations
@@ -17,8 +16,7 @@ import numpy as np
 
 from sysid.errors.pose_objective import DriveResiduals, Objective
 from sysid.errors.prior import expected_sd
-from sysid.errors.robust import HUBER
-from sysid.errors.space import Space
+from sysid.errors.space import Space, robust_loss
 from sysid.intervals.independence import Information
 from sysid.intervals.uncertainty import PIECES, Uncertainty
 from sysid.search import least_squares
@@ -36,16 +34,14 @@ GROUPS = {
 """What is measured in one way, and so known or unknown together."""
 DAMPING = 1e-3
 ITERATIONS = 15
-LARGEST = 1e30
-"""Error of a replay that diverged."""
+LARGEST = 1e30  # error of a replay that diverged
 
 
 @dataclass(frozen=True)
 class Choice:
     """Groups that keep their stated sizes, and where that leads."""
 
-    names: tuple[str, ...]
-    """Of `GROUPS`."""
+    names: tuple[str, ...]  # of `GROUPS`
     u: np.ndarray  # (P,)
     cost: float
 
@@ -56,13 +52,9 @@ def chosen_sizes(
 ) -> Choice:
     """The point (P,) at which only those groups differ from what was stated that the drives need.
 
-    A group that all drives together contradict is free. Others are judged by drives that are held back.
-
     Args:
-        objective: what the search ended on.
+        objective: what the search ended on; `cost` there, and `known`: errors and information of each drive there.
         poses: errors of whole poses of the same drives.
-        known: errors where the search ended, and the information that each drive has there.
-        cost: there.
         kept: parameters that a person chose to fit.
         robust: whether large residuals count linearly.
     """
@@ -86,11 +78,8 @@ def chosen_sizes(
 
 
 def contradicted(known: Uncertainty, space: Space) -> set[str]:
-    """Parameters that are more likely free than as stated.
-
-    The ratio of both marginal likelihoods is that of posterior and prior density at the stated value (Savage and
-    Dickey; Dickey, 1971). The prior is as wide as data sheets are usually off.
-    """
+    """Parameters that are more likely free than as stated, by posterior over prior density there (Savage and Dickey;
+    Dickey, 1971); the prior is as wide as data sheets are usually off."""
     away = np.square((known.evidence.u - space.to_unit(space.initial)) / known.deviation)
     wider = np.square(expected_sd(space) / known.deviation)  # the prior, beside the errors
     free = away * wider / (1 + wider) > np.log(1 + wider)
@@ -100,12 +89,9 @@ def contradicted(known: Uncertainty, space: Space) -> set[str]:
 def simplest(errors: np.ndarray, held: np.ndarray) -> int:
     """The option that holds most and whose mean error is within a standard error of the least (Breiman et al., 1984).
 
-    Among as simple ones it is the best. That standard error is of gains by the best option, and its variance twice the
-    mean square of those below 0: what a right size gains in a single manoeuvre is no noise.
-
-    Args:
-        errors: (G, O) of G manoeuvres and O options.
-        held: (O,) how many parameters each option holds.
+    From errors (G, O) of G manoeuvres and O options that hold `held` (O,) parameters; among as simple ones the best.
+    The standard error is of gains by the best option, its variance twice the mean square of those below 0: what a right
+    size gains in a single manoeuvre is no noise.
     """
     mean = errors.mean(0)
     gains = errors - errors[:, [mean.argmin()]]
@@ -123,12 +109,7 @@ class _Follow:
     stated: np.ndarray  # (P,)
 
     def __call__(self, held: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-        """The point (P,).
-
-        Args:
-            held: (P,) bool, parameters that are as stated.
-            fitted: (B, PIECES) bool, pieces of drives that count.
-        """
+        """The point (P,) with `held` (P,) parameters as stated, by the `fitted` (B, PIECES) pieces of drives."""
         one, prior = self.evidence, self.objective.prior
         hessian = (one.blocks * fitted[..., None, None]).sum((0, 1)) + one.precision
         gradient = (one.scores * fitted[..., None]).sum((0, 1))
@@ -141,8 +122,7 @@ class _Follow:
 
 
 def _folds(evidence: Information) -> np.ndarray:
-    """(B, PIECES) number of the part that each piece is held back with: a manoeuvre, a drive, or half of the only
-    one."""
+    """(B, PIECES) number of the part that each piece is held back with: a manoeuvre, a drive, or half of one."""
     drives = len(evidence.groups)
     numbers = evidence.groups if len(np.unique(evidence.groups)) > 1 else np.arange(drives)
     if drives > 1:
@@ -151,8 +131,7 @@ def _folds(evidence: Information) -> np.ndarray:
 
 
 def _held_back(follow: _Follow, poses: Objective, held: np.ndarray, robust: bool) -> np.ndarray:
-    """(G, O) squared errors of whole poses in each part of the drives that is held back, of each option `held`
-    (O, P)."""
+    """(G, O) squared errors of whole poses in each part of the drives that is held back, of options `held` (O, P)."""
     folds = _folds(follow.evidence)
     numbers = np.unique(folds)
     points = np.stack([[follow(one, folds != number) for one in held] for number in numbers])  # (G, O, P)
@@ -173,7 +152,6 @@ def _errors(poses: Objective, points: np.ndarray, robust: bool) -> np.ndarray:
     for first in range(0, len(points), together):
         residual = poses.residuals(points[first : first + together])
         label = np.pad(piece, (0, residual.shape[2] - len(piece)))  # errors of the start belong to the first piece
-        large = np.abs(residual)
-        loss = np.where((large > HUBER) & robust, 2 * HUBER * large - HUBER**2, large**2)
+        loss = robust_loss(residual, robust)
         found.append(np.stack([loss[:, :, label == k].sum(-1) for k in range(PIECES)], axis=-1))
     return np.concatenate(found)

@@ -24,17 +24,13 @@ from urllib.parse import unquote, unquote_plus
 import numpy as np
 
 BATCH = {"tpe": 4, "cmaes": 16}
-"""Candidates that are asked for and simulated together. Of TPE as many as a processor replays at no loss: the fewer are
-asked for at once, the more is known of those before. Of CMA-ES its population."""
+"""Candidates simulated together: of TPE as many as a processor replays at no loss, of CMA-ES its population."""
 STARTUP = 32  # random candidates of TPE before it draws from those that it knows
-LEASE = 600.0
-"""Seconds after which a process on another machine that has not been heard of counts as dead."""
+LEASE = 600.0  # seconds after which a process on another machine that has not been heard of counts as dead
 POLL = 0.2  # s between looks while others finish
-UNNAMED = 10.0
-"""Seconds after which a candidate without a process's name on it was made by one that died in between."""
+UNNAMED = 10.0  # seconds after which a candidate without a process's name on it was made by one that died in between
 HIDDEN = "***"
-HOST = re.compile(r"(\[[^\]]*\]|[^:]*)(:\d*)?")
-"""Name or address of a server, and its port."""
+HOST = re.compile(r"(\[[^\]]*\]|[^:]*)(:\d*)?")  # name or address of a server, and its port
 SECRET_OPTION = re.compile(r"([?&;][^=&;]*(?:pass|secret|token|key|auth)[^=&;]*)=([^&;]*)", re.IGNORECASE)
 """An option of a URL whose value is not shown."""
 SIGMA = 0.2  # first standard deviation of CMA-ES, in unit coordinates
@@ -117,8 +113,7 @@ def _masked(message: str, storage: str) -> str:
 class StudyPlace:
     """Where a study is kept, and what it is about."""
 
-    storage: Any = None
-    """Of `open_storage`, or what it opens; None keeps the study in memory."""
+    storage: Any = None  # of `open_storage`, or what it opens; None keeps the study in memory
     name: str = "fit"
     problem: Mapping[str, str] = field(default_factory=dict)
     """What is searched, as short texts; a study of another problem is refused."""
@@ -130,14 +125,9 @@ class SharedStudy:
     def __init__(
         self, names: tuple[str, ...], initial: np.ndarray, place: StudyPlace, *, method: str = "tpe", seed: int = 0
     ):
-        """Create or join the study.
+        """Create or join the study of parameters `names` (unit coordinates), which begins at `initial` (P,).
 
-        Args:
-            names: of the parameters, in unit coordinates.
-            initial: (P,) where the search begins.
-
-        Raises:
-            ValueError: the study is of another problem, or the method is unknown.
+        ValueError where the study is of another problem, or the method is unknown.
         """
         import optuna
 
@@ -172,10 +162,7 @@ class SharedStudy:
 
     def run(self, costs: Callable[[np.ndarray], np.ndarray], evaluations: int,
             progress: Callable[[int, str], None] | None = None) -> None:
-        """Ask, simulate and tell until the study has `evaluations` costs, whoever told them.
-
-        Args:
-            costs: unit coordinates (N, P) -> costs (N,); always called with a whole batch.
+        """Ask, simulate (unit coordinates (N, P) -> costs (N,), whole batches) and tell until there are enough costs.
         """
         best = np.inf
         while True:
@@ -221,8 +208,7 @@ class SharedStudy:
         return len(left)
 
     def table(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """Unit coordinates (N, P) and costs (N,) of all candidates in the order they were asked, and which of them has
-        the initial values."""
+        """Unit coordinates (N, P) and costs (N,) of all candidates, and which of them has the initial values."""
         trials = self._study.get_trials(deepcopy=False, states=(self._optuna.trial.TrialState.COMPLETE,))
         trials = sorted(trials, key=lambda trial: trial.number)
         initial = next((i for i, trial in enumerate(trials) if trial.user_attrs.get("initial")), 0)

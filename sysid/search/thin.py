@@ -1,5 +1,4 @@
-"""Thin logs: parameters that a log cannot determine keep their value in a fit, and logs that determine nothing are
-refused. What `sysid.inspect` says of a log binds the fit."""
+"""Thin logs: parameters that a log cannot determine keep their value; logs that determine nothing are refused."""
 
 from __future__ import annotations
 
@@ -11,8 +10,7 @@ from sysid.logs.records import Log, Trial
 
 LEAST_SECONDS = 2.0  # s of commanded motion that a log must have
 TURNS, DRIVES = 0.1, 0.05  # rad/s and m/s of commands below which nothing turns or drives
-UNSEEN = "the log cannot show it"
-"""Begins the reason for which a parameter keeps its value."""
+UNSEEN = "the log cannot show it"  # begins the reason for which a parameter keeps its value
 
 HIDDEN = {
     "no outside pose": ("slip_traction.*", "axle_pivot.*", "lateral_damping.*", "geom.*.friction"),
@@ -21,8 +19,7 @@ HIDDEN = {
                 "body.*.inertia"),
     "no straight motion": ("rolling_resistance.*", "slip_traction.slip_speed", "suspension.*", "body.com_x",
                            "body.com_z"),
-}
-"""Cause -> parameters that it hides, as patterns: of the simulator's vehicle and of robot files."""
+}  # cause -> parameters that it hides, as patterns: of the simulator's vehicle and of robot files
 REMEDIES = {"no outside pose": "log motion capture, lidar or RTK", "no turn": "turn on the spot and drive circles",
             "no straight motion": "drive straight at two speeds"}
 
@@ -36,11 +33,7 @@ def causes(trials: Sequence[Trial]) -> list[str]:
 
 
 def check_moves(log: Log) -> None:
-    """Refuse a log that determines nothing.
-
-    Raises:
-        ValueError: no training trial is commanded to move for a while.
-    """
+    """Refuse a log of which no training trial is commanded to move for a while: it determines nothing."""
     seconds = 0.0
     for trial in log.training:
         command = trial.command

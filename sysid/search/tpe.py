@@ -20,27 +20,18 @@ __all__ = ["fit"]
 class GlobalSearch:
     """How a global search goes."""
 
-    evaluations: int = 500
-    """Parameter sets to try; in a shared study, by all its processes together."""
+    evaluations: int = 500  # parameter sets to try; in a shared study, by all its processes together
     seed: int = 0
-    cost: str = "weighted"
-    """"weighted" (least squares over all channels) or "paper" (sum of position RMSE)."""
-    method: str = "tpe"
-    """"tpe" or "cmaes"."""
-    best: int = 4
-    """How many of the best candidates to return in `starts`."""
+    cost: str = "weighted"  # "weighted" (least squares over all channels) or "paper" (sum of position RMSE)
+    method: str = "tpe"  # "tpe" or "cmaes"
+    best: int = 4  # how many of the best candidates to return in `starts`
 
 
 def fit(
     objective: Objective, space: Space, search: GlobalSearch, place: StudyPlace = StudyPlace(),  # noqa: B008
     progress: Progress | None = None,
 ) -> FitResult:
-    """Minimise over `space`; the initial values are the first candidate.
-
-    Args:
-        objective: errors in unit coordinates of `space`.
-        place: of a study that several processes share; its problem is added to.
-    """
+    """Minimise an objective over `space`, from the initial values on, in a study that processes may share."""
     costs: Callable[[np.ndarray], np.ndarray] = {
         "weighted": objective.weighted_cost, "paper": objective.paper_cost}[search.cost]
     about = {"cost": search.cost, "initial values": ", ".join(f"{value:.6g}" for value in space.initial),

@@ -36,13 +36,9 @@ def gradient_search(
 ) -> tuple[FitResult, DriveResiduals, list[tuple[str, np.ndarray, np.ndarray]]]:
     """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
 
-    What drives hardly determine, such as how far a suspension sags, may be right in another valley, and the range
-    between looks flat from here: LM tries the ends of ranges that cost little. A torque limit that is never met looks
-    right too: LM also starts far away along every range, and does so again where that led far down. Delays are profiled
-    on a grid, and LM tries another valley that is about as deep. The floors of valleys are jagged: at the end slopes
-    averaged over what estimates err lead on (`sysid.search.slopes`). From the floor the ends of ranges are tried
-    again, since what hid them may be gone.
-    Nothing of this is done without `config.elsewhere`.
+    With `config.elsewhere` other valleys are tried: ends of ranges that cost little, points far along every range,
+    delays on a grid. Floors are jagged: at the end slopes averaged over what estimates err lead on
+    (`sysid.search.slopes`), and the ends of ranges are tried again, since what hid them may be gone.
     """
 
     binned = isinstance(objective, FeatureObjective)
@@ -106,8 +102,8 @@ def from_all(
 def _from_ends(
     search: Search, objective: DriveResiduals, result: FitResult, iterations: int, robust: bool
 ) -> FitResult:
-    """The result with where searches from those ends of ranges lead that cost little. An end that costs what is here
-    lies on the same ground, and a search from it hardly leads on: such are tried where there are no others."""
+    """The result with where searches from ends of ranges lead that cost little, those that cost as much as here last.
+    """
     costs, points = least_squares.ends_of_ranges(objective, result.u, robust=robust)
     near, level = costs < FLAT * result.cost, np.abs(costs - result.cost) <= WORTH * result.cost
     near = near & ~level if (near & ~level).any() else near
@@ -117,8 +113,7 @@ def _from_ends(
 def _from_elsewhere(
     search: Search, objective: DriveResiduals, result: FitResult, starts: np.ndarray, iterations: int
 ) -> FitResult:
-    """The result with where a search from other starts (S, P) ends, if that is lower: they are followed for a few
-    iterations, the best of them to its end where it is lower by then."""
+    """The result with where a search from other starts (S, P) ends, if that is lower after a few iterations."""
     if not len(starts):
         return result
     spent = result.evaluations

@@ -136,6 +136,34 @@ def left_out(design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: 
     return np.array(out)
 
 
+def log_densities(
+    design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: Sequence[Sequence[int]], noise: float
+) -> np.ndarray:
+    """(G,) log density of each manoeuvre in a target (B, n / B), as columns (n, F) with precision (F, F) predict it
+    from the other manoeuvres. What does not depend on the columns is left out.
+
+    What the other manoeuvres do not determine is unsure, not wrong: an effect may be of another size in each of them.
+
+    Args:
+        noise: variance of the target beside the columns.
+    """
+    columns = design.reshape(len(target), -1, design.shape[1])
+    design, flat = design / noise**0.5, target.reshape(-1) / noise**0.5
+    whole = design.T @ design + prior, design.T @ flat, float(flat @ flat)
+
+    def evidence(matrix: np.ndarray, right: np.ndarray, squares: float) -> float:
+        half = np.linalg.cholesky(matrix + RIDGE * max(float(np.trace(matrix)), 1e-9) * np.eye(len(matrix)))
+        return -float(squares - np.square(np.linalg.solve(half, right)).sum()) / 2 - float(np.log(np.diag(half)).sum())
+
+    out = []
+    for group in groups:
+        x = columns[list(group)].reshape(-1, design.shape[1]) / noise**0.5
+        y = target[list(group)].reshape(-1) / noise**0.5
+        others = whole[0] - x.T @ x, whole[1] - x.T @ y, whole[2] - float(y @ y)
+        out.append(evidence(*whole) - evidence(*others))
+    return np.array(out)
+
+
 def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solution of equations that may be dependent."""
     return np.linalg.solve(matrix + RIDGE * max(float(np.trace(matrix)), 1e-9) * np.eye(len(matrix)), right)

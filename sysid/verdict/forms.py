@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sysid.missing.joint_fit import Refit, Replays, without_each
-from sysid.verdict.agreement import left_out, solved
+from sysid.verdict.agreement import log_densities, solved
 
 MOST = 2.0
 """Largest size of a modulation: it is 1 at the 90 % quantile of the speed."""
@@ -79,24 +79,31 @@ class Forms:
         solution, design = self._solved(columns, self.bent, form, self.target)
         return (self.target - design @ solution).reshape(self.shape)
 
-    def gain(self, form: float, number: int, groups: Sequence[Sequence[int]]) -> tuple[float, np.ndarray]:
+    def gain(
+        self, form: float, number: int, groups: Sequence[Sequence[int]], noise: float = 1.0
+    ) -> tuple[float, np.ndarray]:
         """By how much one of the effects, in the form of its law, lowers the cost beside other forms of the others.
 
         It is taken away whole: columns around its size say little of a dead zone or a limit without it.
 
+        Args:
+            noise: variance of the white residual.
+
         Returns:
-            The gain on all drives, and on each manoeuvre (G,) with all sizes fitted to the others.
+            The gain on all drives; and by how much the effect raises the log density of each manoeuvre (G,), as all
+            other manoeuvres predict it.
         """
         target = self.target + self.changes[number]
         others = [one for i, one in enumerate(self.sizes) if i != number]
         bent = [one for i, one in enumerate(self.bent) if i != number]
-        costs, apart = [], []
+        costs, densities = [], []
         for mine in ([], [self.changes[number][:, None]]):
             columns = [self.base, *others, *mine]
             solution, design = self._solved(columns, bent, form, target)
             costs.append(float(target @ target - target @ design @ solution))
-            apart.append(left_out(design, self._prior(columns, bent, form), target.reshape(self.shape), groups))
-        return max(costs[0] - costs[1], 0.0), apart[0] - apart[1]
+            densities.append(log_densities(design, self._prior(columns, bent, form), target.reshape(self.shape), groups,
+                                           noise))
+        return max(costs[0] - costs[1], 0.0), densities[1] - densities[0]
 
     def deviations(self, form: float, number: int, noise: float = 1.0) -> list[Deviation]:
         """How far one of the effects is off the catalogue's law over speed, yaw rate and time, of its mean size.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
-from sysid.errors.noise_level import NoiseLevels
+from sysid.errors.noise import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER

@@ -33,9 +33,9 @@ class Thresholds:
     """What decides. Frozen before any drive is looked at; part of the manifest."""
 
     alpha: float = 0.005
-    """Prior odds of each effect, and of something unknown, against nothing; and the family-wise p-value below which a
-    scan is worth a refit and an effect more than chance. Of two effects the one whose posterior weight is a smaller
-    share of the other's is not in its class."""
+    """Prior odds of each effect, and of something unknown, against nothing; and the family-wise p-value below which an
+    effect of a scan is worth a refit. Of two effects the one whose posterior weight is a smaller share of the other's
+    is not in its class."""
     form: float = 0.5
     """Standard deviation of an effect's form from the catalogue's law, as a share of its size."""
     share: float = 0.6
@@ -83,7 +83,7 @@ class TriedSet:
     own: tuple[float, ...]
     """By how much each effect lowers the cost beside other forms of the others."""
     foretold: tuple[float, ...]
-    """Lower 95 % end of what each effect so gains on manoeuvres, with all sizes fitted to the other manoeuvres."""
+    """Lower 95 % end of how much each effect so raises the log density of manoeuvres that the others predict."""
     bent: Left
     """What is left where all may have other forms."""
     classes: tuple[tuple[str, ...], ...]
@@ -164,12 +164,12 @@ class Findings:
 
     def able(self, one: TriedSet, priors: Thresholds) -> bool:
         """Whether a set may be named: it is no larger than `MOST`, and every effect does more than to mend the form of
-        the others. Beside these it is significant and outweighs its prior odds, where what all forms leave counts as
-        noise, and the others' manoeuvres foretell it."""
+        the others. Beside these it outweighs its prior odds, where what all forms leave counts as noise, and the
+        others' manoeuvres foretell it."""
         noise = 1 + max(one.bent.excess, 0.0)
         worth = min(self.log_weight(gain / noise, 1, priors) for gain in one.own) > 0
         known = len(one.effects) == 1 or min(one.foretold) > 0
-        return len(one.effects) <= MOST and max(one.p) < priors.alpha and worth and known
+        return len(one.effects) <= MOST and worth and known
 
     def log_weight(self, gain: float, effects: int, priors: Thresholds) -> float:
         """Of an explanation: what it gains, in units of what days differ by, less log(1 / alpha) for each effect."""
@@ -252,7 +252,7 @@ def _log_weights(findings: Findings, priors: Thresholds, best: TriedSet | None) 
 def choose(findings: Findings, priors: Thresholds) -> int | None:
     """The number of the set of the largest posterior weight, if there is any.
 
-    Every effect of it must be significant and more than another form of the others.
+    Every effect of it must be more than another form of the others.
     """
     able = [i for i, one in enumerate(findings.sets) if findings.able(one, priors)]
     return max(able, key=lambda i: findings.log_weight(findings.sets[i].gain, len(findings.sets[i].effects), priors),

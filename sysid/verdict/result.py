@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from sysid.errors.noise_level import NoiseLevels
+from sysid.errors.noise import NoiseLevels
 from sysid.logs.floor import FloorChange
 from sysid.logs.records import Log, Trial
 from sysid.missing.catalogue import Hypothesis, base_values

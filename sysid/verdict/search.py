@@ -115,8 +115,8 @@ def _weighed(asked: Asked, members: Sequence[Candidate], rivals: Sequence[Sequen
     forms = forms_of(asked.refitter, fit, asked.evidence.groups)
     form, count = asked.thresholds.form, range(len(members))
     bent = _left(asked, forms.left(form))
-    own = [forms.gain(form, i, asked.evidence.groups) for i in count]
     noise = 1 + max(bent.excess, 0.0)
+    own = [forms.gain(form, i, asked.evidence.groups, noise) for i in count]
     p = [p_of_last(asked, moved_last(fit, i), gain / noise) for i, (gain, _) in enumerate(own)]
     numbers = TriedSet(
         tuple(one.effect for one in fit.hypotheses), tuple(one.key for one in fit.hypotheses), tuple(fit.q.tolist()),

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.errors.features import channel_names
-from sysid.errors.noise import replicate_groups
-from sysid.errors.noise_level import NoiseLevels, NoisyDrives, noise_levels, steady_bins
+from sysid.errors.noise import NoiseLevels, NoisyDrives, noise_levels, replicate_groups, steady_bins
 from sysid.missing.days import Reference
 from sysid.missing.drives import Drives
 from sysid.missing.reference import replicate_groups_by_day

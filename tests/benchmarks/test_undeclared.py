@@ -103,6 +103,22 @@ def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, results):
 
 
 @pytest.mark.quick
+def test_logs_of_later_draws_have_figures_of_their_own_beside_those_of_the_first(tmp_path, results):
+    recorded = json.loads(results.read_text())
+    for draw in (1, 2):
+        judged(tmp_path, f"null_000_draw_{draw}", {**NOTHING, "draw": draw}, {})
+    undeclared_figures.figures(tmp_path, Driven(draw=1))
+    after = json.loads(results.read_text())
+    assert after["figures"]["false_alarms_fresh"]["unit"] == "of 2 logs with nothing in them"
+    assert after["figures"]["false_alarms"] == recorded["figures"]["false_alarms"]
+    assert after["sizes"] == recorded["sizes"]
+    nulls = [row["draw"] for row in after["confusion"] if row["stage"] == "null" and row.get("draw", 0)]
+    assert nulls == [1, 2]  # those recorded before are of logs judged anew
+    first = [row for row in recorded["confusion"] if not row.get("draw", 0)]
+    assert [row for row in after["confusion"] if not row.get("draw", 0)] == first
+
+
+@pytest.mark.quick
 def test_another_noise_level_has_figures_and_verdicts_of_its_own(tmp_path, results):
     recorded = json.loads(results.read_text())
     verdict = {"stage": "scaled", "scale": 4.0, "verdict": "named", "share": 0.9, "p_value": 0.01, "seconds": 1.0,

@@ -14,7 +14,7 @@ pytest.importorskip("mujoco")
 from benchmarks import undeclared, undeclared_figures  # noqa: E402
 from benchmarks import undeclared_plant as contact  # noqa: E402
 from benchmarks import undeclared_reference as days  # noqa: E402
-from sysid.follow_up import calibrated  # noqa: E402
+from sysid.follow_up import power  # noqa: E402
 from sysid.verdict.result import LoopConfig  # noqa: E402
 
 pytestmark = pytest.mark.quick
@@ -60,6 +60,32 @@ def test_sets_of_reference_days_share_no_drive(tmp_path, driven):
     assert len(driven) == 3 * days.DAYS
 
 
+def test_another_draw_shares_no_seed_name_or_pair_with_the_first(tmp_path, driven, monkeypatch):
+    monkeypatch.setattr(contact, "make_log", lambda path, experiment: driven.update({path: experiment.seed}))
+    nothing = SimpleNamespace(search=SimpleNamespace(verdict="none"))
+    monkeypatch.setattr(contact, "find_missing", lambda *_, **__: nothing)
+    monkeypatch.setattr(contact, "brief", lambda _: {})
+    monkeypatch.setattr(contact, "load_log", str)
+    asked = {"nulls": 3, "scales": (2.0, 4.0), "pairs": 9, "sensor_noise": (2.0,), "noisy_nulls": 3}
+    draws = [undeclared.Benchmark(**asked, draw=draw, work=tmp_path / str(draw)) for draw in (0, 1, 2)]
+    logs, seeds = [undeclared.wanted(one) for one in draws], []
+    for settings, listed in zip(draws, logs, strict=True):
+        driven.clear()
+        days.reference_days(settings.work, settings.driven)
+        for job in listed:
+            contact.judge(job, None, settings.work, LoopConfig(), False, settings.driven)
+        assert len(driven) == days.DAYS + len(listed)
+        seeds += driven.values()
+    assert len(set(seeds)) == len(seeds)
+    assert len({job.label for listed in logs for job in listed}) == 3 * len(logs[0])
+    assert len({str([job.effects for job in listed if job.stage == "pair"]) for listed in logs}) == 3
+
+
+def test_a_log_of_another_draw_is_asked_for_by_its_name_in_the_first(tmp_path):
+    one = undeclared.Benchmark(nulls=3, draw=4, labels=("null_002",), work=tmp_path)
+    assert [job.label for job in undeclared.wanted(one)] == ["null_002_draw_4"]
+
+
 def test_a_set_beyond_the_seeds_is_refused(tmp_path):
     with pytest.raises(ValueError, match="fewer sets"):
         days.reference_days(tmp_path, number=days.SETS)
@@ -96,7 +122,7 @@ def nulls_of(p_values, sets):
 
 
 def test_uniformity_is_told_of_the_sets_that_did_not_calibrate():
-    skewed = stats.beta.ppf((np.arange(200) + 0.5) / 200, *calibrated.shape())  # uniform when calibrated
+    skewed = stats.beta.ppf((np.arange(200) + 0.5) / 200, *power.shape())  # uniform when calibrated
     even, odd = np.full(200, 1e-3), skewed
     found = undeclared_figures.of_nulls(nulls_of(np.stack([even, odd], 1).ravel(), 4))
     assert found["null_ks_p"]["unit"] == "of 200 logs over 2 sets of reference days"
@@ -104,9 +130,16 @@ def test_uniformity_is_told_of_the_sets_that_did_not_calibrate():
     assert found["false_alarms"]["unit"] == "of 400 logs with nothing in them"
 
 
+def test_another_draw_calibrates_nothing_and_has_sets_of_its_own():
+    nulls = [{**one, "draw": 1 + i % 3} for i, one in enumerate(nulls_of(np.linspace(0.1, 0.9, 9), 1))]
+    found = undeclared_figures.of_nulls(nulls)
+    assert found["false_alarms"]["sets"] == 3
+    assert found["null_ks_p"]["unit"] == "of 9 logs over 3 sets of reference days"
+
+
 def test_calibration_finds_the_distribution_that_p_values_follow(tmp_path, monkeypatch):
     monkeypatch.setattr(undeclared_figures, "FILE", tmp_path / "null_p.json")
-    monkeypatch.setattr(calibrated, "FILE", tmp_path / "null_p.json")
+    monkeypatch.setattr(power, "FILE", tmp_path / "null_p.json")
     for folder in ("verdicts", "truth"):
         (tmp_path / folder).mkdir()
     drawn = np.random.default_rng(5).beta(0.6, 0.8, 600)
@@ -114,13 +147,13 @@ def test_calibration_finds_the_distribution_that_p_values_follow(tmp_path, monke
         (tmp_path / "truth" / f"null_{i}.json").write_text("{}")
         (tmp_path / "verdicts" / f"null_{i}.json").write_text(json.dumps(one))
     undeclared_figures.calibrate(tmp_path)
-    calibrated.shape.cache_clear()
+    power.shape.cache_clear()
     try:
-        assert calibrated.shape() == pytest.approx((0.6, 0.8), rel=0.2)
-        assert stats.kstest([calibrated.calibrated(p) for p in drawn[1::2]], "uniform").pvalue > 0.05
+        assert power.shape() == pytest.approx((0.6, 0.8), rel=0.2)
+        assert stats.kstest([power.calibrated(p) for p in drawn[1::2]], "uniform").pvalue > 0.05
         assert stats.kstest(drawn[1::2], "uniform").pvalue < 1e-3
     finally:
-        calibrated.shape.cache_clear()
+        power.shape.cache_clear()
 
 
 def test_calibration_asks_for_enough_logs(tmp_path):

@@ -12,11 +12,12 @@ IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 
 
-def frames(rate=10.0, age=0.01, pace=1.0, changing=True, lost=0, pause_at=None, seconds=2.0):
+def frames(rate=10.0, age=0.01, pace=1.0, changing=True, lost=0, pause_at=None, seconds=2.0, set_at=None):
     log = FrameLog()
     now = 100.0
     while now < 100.0 + seconds:
-        log.frame(now, now * pace, age, int(now * 1000) if changing else 7)
+        step = 10.0 if set_at is not None and now > 100.0 + set_at else 0.0
+        log.frame(now, now * pace + step, age, int(now * 1000) if changing else 7)
         now += 1 / rate + (0.5 if pause_at is not None and abs(now - 100 - pause_at) < 0.5 / rate else 0)
     if lost:
         log.lost(now, lost)
@@ -51,6 +52,7 @@ def test_nothing_is_named_where_all_is_well():
     ({"frames": frames(age=10.0)}, ["10.00 s behind", "chrony"]),
     ({"frames": frames(age=-10.0)}, ["10.00 s ahead of", "--stamp-age inf"]),
     ({"frames": frames(pace=0.5)}, ["0.50 times real time", "--pace stamp"]),
+    ({"frames": frames(pace=0.0, age=1e9)}, ["the same stamp", "header.stamp"]),
     ({"frames": frames(changing=False)}, ["do not change", "frozen"]),
     ({"unusable": "image encoding '8UC3'"}, ["8UC3"]),
     ({"blind": True}, ["uniformly black or white", "exposure"]),
@@ -64,6 +66,11 @@ def test_nothing_is_named_where_all_is_well():
 def test_cause_is_named_once_with_its_remedy(changes, texts):
     (text,) = found(**changes)
     assert all(part in text for part in texts)
+
+
+@pytest.mark.parametrize("set_at", [0.05, 1.0, 1.85])
+def test_clock_that_is_set_once_is_no_simulator_off_real_time(set_at):
+    assert found(frames=frames(set_at=set_at)) == []
 
 
 def test_several_causes_are_all_named():

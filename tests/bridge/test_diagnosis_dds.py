@@ -32,8 +32,11 @@ def test_unreadable_encoding_is_named_while_it_lasts_and_blamed_for_no_later_sto
     robot.wait_for_status(driving=True)
     second = graph.peer("second")
     second.camera()
-    status = robot.wait_for_status(causes="2 publishers (/robot, /second)")
+    status = robot.wait_for_status(driving=False, holds="an input has two publishers",
+                                   causes="2 publishers (/robot, /second)")
     assert "8UC3" not in str(status)
+    graph.peers.remove(second), second.close()
+    robot.wait_for_status(driving=True, causes="[]")
 
 
 def test_base_that_listens_to_another_type_than_is_sent_is_named_and_nothing_drives(graph, policy):

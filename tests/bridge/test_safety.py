@@ -374,3 +374,16 @@ def test_slow_driving_scales_the_command_while_it_is_asked_for():
 def test_slew_limits_that_forbid_moving_are_refused():
     with pytest.raises(ValueError, match="never moves"):
         SafetyConfig(low=(-1.0, -1.0), high=(1.0, 1.0), slew=(0.0, 1.0))
+
+
+def test_reason_of_a_stop_is_not_given_for_what_follows_once_it_is_over():
+    drive = Drive()
+    drive.supervisor.latch("emergency stop")
+    drive.frame()
+    assert drive.supervisor.reason == "emergency stop" and drive.supervisor.arm()
+    assert (drive.supervisor.state, drive.supervisor.reason) == (State.STANDING, "waiting for fresh frames")
+    drive = Drive()
+    drive.supervisor.block("no guard", True)
+    assert drive.supervisor.reason == "no guard"
+    drive.supervisor.block("no guard", False)
+    assert (drive.supervisor.state, drive.supervisor.reason) == (State.STANDING, "waiting for fresh frames")

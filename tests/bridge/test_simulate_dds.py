@@ -171,3 +171,13 @@ def test_a_planar_covariance_leaves_what_is_not_measured_open():
     values = planar_covariance(0.1, 0.2, 0.3)
     assert values[0] == pytest.approx(0.01) and values[7] == pytest.approx(0.04) and values[35] == pytest.approx(0.09)
     assert values[14] == values[21] == values[28] == 1e6 and sum(value != 0 for value in values) == 6
+
+
+def test_simulator_says_when_it_is_ready_where_it_listens_and_how_an_episode_ended(graph):
+    peer = graph.peer()
+    odometry = listen(peer, "nav_msgs/Odometry", "whill/odom")
+    graph.start("simulate", "--simulator", "benchmarks.bridge:ShortRobot", "--wait", 0, "--episodes", 1)
+    peer.wait_until(lambda _: odometry)
+    assert "ready; commands are heard on /whill/controller/cmd_vel" in graph.log("simulate")
+    assert graph.wait("simulate") == 0, graph.log("simulate")
+    assert "episode 1: neither arrived nor collided after 10 steps and 0 commands" in graph.log("simulate")

@@ -181,7 +181,7 @@ def test_step_that_onnx_computes_differently_is_refused(tmp_path, monkeypatch):
 
     original = dreamer.export.to_onnx
     monkeypatch.setattr(dreamer.export, "to_onnx", wrong_model)
-    with pytest.raises(ValueError, match="a step of it differs from JAX"):
+    with pytest.raises(ValueError, match="it differs from JAX"):
         export_policy(tmp_path / "p", step, {"h": np.zeros(2, np.float32)}, {}, CONTRACT, check_steps=5)
     assert not list(tmp_path.iterdir())
 

@@ -62,8 +62,8 @@ def unicycle_objective(trials, space: Space = UNICYCLE_SPACE) -> Objective:
 @pytest.fixture(scope="session")
 def unicycle_log(tmp_path_factory):
     """Log of the kinematic vehicle at TRUTH, with sensor noise."""
+    from benchmarks.planted_logs import Schedule, write_dataset
     from sysid.logs.log import load_log
-    from sysid.logs.synthetic import Schedule, write_dataset
 
     folder = tmp_path_factory.mktemp("unicycle") / "log"
     write_dataset(folder, WHILL_CR, jnp.asarray(TRUTH), Schedule(replicates=2, scenario=SHORT, seed=3),

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from benchmarks.plant.first_day import SMALL, Day, Wrong, make_uncalibrated, tracked, write_mjcf, write_urdf
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.prior import UNKNOWN, bounds_alone
 from sysid.errors.space import make_space
 from sysid.intervals.uncertainty import Estimate, estimate
 from sysid.logs.log import load_log, make_trial
 from sysid.logs.records import Log, OdometryStream, PoseStream
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.reference import ASSUMED_SPREAD, assumed_spread
-from sysid.pages.calibration import UNKNOWN as NOT_TOLD
-from sysid.pages.calibration import calibration_notes
+from sysid.pages.fit_report import UNKNOWN as NOT_TOLD
+from sysid.pages.fit_report import calibration_notes
 from sysid.replay.mjcf import mjcf_model
 from sysid.replay.model_files import load_model
 from sysid.replay.models import set_parameters, with_effects

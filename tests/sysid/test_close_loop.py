@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.close_loop import Arguments, main
 from sysid.errors.features import CHANNELS, make_features
 from sysid.errors.noise import deviations, replicate_groups
@@ -17,7 +18,6 @@ from sysid.follow_up.unnamed import vehicle_of, with_start_angles
 from sysid.follow_up.wrench_tables import WrenchTable
 from sysid.logs.log import load_log
 from sysid.logs.metrics import own_floor, score
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
 from sysid.missing.joint_fit import without_each

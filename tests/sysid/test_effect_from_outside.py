@@ -15,9 +15,9 @@ import outside_effect
 import pytest
 from outside_effect import HeadingDrift
 
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.follow_up.next_manoeuvre import sensor_for
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.catalogue import falsifiers, hypotheses
 from sysid.pages.loop_report import make_report, write_run
 from sysid.replay.models import with_effects

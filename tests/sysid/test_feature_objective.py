@@ -11,8 +11,7 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.errors.prior import Prior, bounds_alone
-from sysid.replay.courses import CourseReplay
-from sysid.replay.differences import DifferenceReplay
+from sysid.replay.differences import CourseReplay, DifferenceReplay
 from sysid.search import least_squares
 from sysid.search.fitting import choose
 from sysid.search.settings import FitConfig

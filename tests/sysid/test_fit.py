@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import sysid.fit as fit_module
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import REPLAYS
 from sysid.replay.rollout import vehicle_plant

@@ -14,8 +14,7 @@ from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.errors.prior import UNKNOWN, Prior, bounds_alone, make_prior, moved
 from sysid.errors.space import Space
 from sysid.intervals import uncertainty
-from sysid.replay.courses import CourseReplay
-from sysid.replay.differences import DifferenceReplay
+from sysid.replay.differences import CourseReplay, DifferenceReplay
 from sysid.search import fitting, least_squares
 from sysid.search.settings import FitConfig
 from whill_mjx.vehicle.presets import preset_params

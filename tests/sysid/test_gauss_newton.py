@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from sysid.replay.quotients import Quotients
+from sysid.replay.arrays import Quotients
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 
 pytestmark = pytest.mark.quick

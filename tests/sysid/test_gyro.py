@@ -9,13 +9,13 @@ import pytest
 
 from benchmarks.plant.make import Experiment, make_log
 from benchmarks.plant.sensors import Gyro
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.errors.features import CHANNELS, GYRO, channel_names, make_features
 from sysid.errors.pose_objective import estimate_noise
 from sysid.logs.gyro import with_sign
 from sysid.logs.log import load_log
 from sysid.logs.records import GyroStream, Log
-from sysid.logs.synthetic import Schedule, write_dataset
-from sysid.replay.courses import CourseReplay
+from sysid.replay.differences import CourseReplay
 from sysid.replay.models import function_model, set_parameters
 from sysid.replay.rollout import make_batch, predictions
 from sysid.search.fitting import fit_log, make_problem

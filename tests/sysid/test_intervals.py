@@ -10,7 +10,7 @@ from conftest import unicycle_objective
 
 from sysid.errors.space import Space
 from sysid.intervals import independence, uncertainty
-from sysid.intervals.sandwich import sandwich
+from sysid.intervals.independence import sandwich
 from sysid.logs.records import Command, Start, Trial
 from sysid.search import least_squares
 

@@ -18,7 +18,7 @@ from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
 from sysid.pages.loop_page import not_determined
-from sysid.pages.loop_report import in_range, unit_of
+from sysid.pages.loop_report import about_of, in_range
 from sysid.pages.verdict_picture import account, draw
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
@@ -58,7 +58,7 @@ def test_an_interval_lies_within_the_physical_range_and_says_what_is_not_determi
         parameter, value, ends, interval, is_open, said):
     found = in_range(parameter, value, ends)
     assert found == {"interval": interval, "open": is_open}
-    words = not_determined({parameter: {**found, "unit": unit_of(parameter)}})
+    words = not_determined({parameter: {**found, "unit": about_of(parameter).unit}})
     assert words == ([] if said is None else [f"the drives do not determine {parameter}{said}"])
 
 
@@ -140,6 +140,13 @@ def test_nothing_is_missing_unless_nothing_has_hardly_any_weight(gain, excess, s
     assert found.verdict == verdict
     assert (found.weights["none"] < Thresholds().alpha) == (verdict != "none")
     assert sum(found.weights.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("effects", [("quadratic_drag",), ("quadratic_drag", "slope")])
+def test_p_values_of_effects_decide_nothing(effects):
+    small, large = (posterior(findings(0.0, [tried(0.0, p, effects, gain=60.0)]), Thresholds()) for p in (1e-6, 0.5))
+    assert small == large and small.verdict == "named"
 
 
 def base_fit(excess):

@@ -11,10 +11,11 @@ from sysid.logs.metrics import replicate_noise
 from sysid.missing.catalogue import Axis, Hypothesis, hypotheses
 from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
-from sysid.missing.joint_fit import Refit
-from sysid.missing.pose_fit import by_own_noise
+from sysid.missing.joint_fit import Refit, Start
+from sysid.missing.pose_fit import by_own_noise, to_its_end
 from sysid.missing.refit import Refitter
 from sysid.replay.records import Measured
+from sysid.search import least_squares
 from sysid.verdict.rounds import elsewhere
 from whill_mjx.effects.side_force import pushed_anywhere
 from whill_mjx.vehicle.presets import preset
@@ -128,3 +129,67 @@ def test_drives_are_weighed_by_what_their_replicates_differ_by(unicycle_log):
     assert weighed[0] == weighed[1] > 1.1 > 0.95 > weighed[2] == weighed[3]
     alone = [replace(one, name=one.manoeuvre) for one in trials[::2]]
     assert by_own_noise(alone, plain) is plain
+
+
+def folded(u):
+    """(N, 1, 2) residuals of a steep valley b = a^2 with a fold every 0.04 along its floor, lowest near a = 0.47."""
+    a, b = u[:, 0], u[:, 1]
+    return np.stack([200 * (b - a**2), 40 * (a - 0.4) + 3 * np.sin(50 * np.pi * a)], axis=-1)[:, None]
+
+
+class OnFolds(Refitter):
+    """Refits of two base parameters that lie anywhere, by derivatives over a share of their range."""
+
+    def __init__(self, u):
+        self.drives = SimpleNamespace(mask=np.ones((1, 3)))
+        self.reference = SimpleNamespace(u=np.array(u), spread=0.29**2 * np.eye(2))
+        self.precision = np.linalg.inv(self.reference.spread)
+        self.low, self.high, self.target = np.zeros(2), np.ones(2), np.zeros((1, 2))
+        sides = folded(self.reference.u + 0.05 * np.concatenate([np.eye(2), -np.eye(2)]))
+        self.white_slopes = np.moveaxis(sides[:2] - sides[2:], 0, -1) / 0.1
+
+    def replayed(self, sets):
+        return [folded(sets)]
+
+    def values_at(self, _, u, __):
+        return u
+
+
+@pytest.mark.parametrize("start", [(0.9, 0.9), (0.8, 0.2), (0.1, 0.9)])
+def test_a_refit_that_came_to_rest_on_a_fold_goes_on_from_there(start):
+    refitter = OnFolds(start)
+    found = refitter.fit((), np.zeros(0), 60)
+    np.testing.assert_allclose(found.u, [0.472, 0.223], atol=2e-3)
+    again = refitter.fit_all([Start.at(found)], 60)[0]
+    assert found.cost - again.cost < 1e-3 * found.cost
+
+
+class Curved:
+    """A steep valley b = a^2 that bends; cost 0.01 at its end, a = 0.4."""
+
+    counted, space = 1, SimpleNamespace(names=("a", "b"), size=2, moved=np.add)
+
+    def residuals(self, u):
+        a, b = u[:, 0], u[:, 1]
+        return np.stack([100 * (b - a**2), a - 0.4, np.full_like(a, 0.1)], axis=-1)[:, None]
+
+    def jacobian(self, u):
+        sides = [self.residuals(u + sign * 1e-4 * one) for one in np.eye(2) for sign in (1, -1)]
+        return self.residuals(u), np.stack([sides[0] - sides[1], sides[2] - sides[3]], axis=-1) / 2e-4
+
+
+def test_a_fit_to_poses_is_followed_until_another_search_gains_nothing():
+    begun = []
+
+    def objective(at):
+        begun.append(at)
+        return Curved()
+
+    start = np.array([0.9, 0.1])
+    one = least_squares.fit(Curved(), starts=start[None], stop=least_squares.Stopping(2))
+    end = to_its_end(objective, start, 2)
+    np.testing.assert_array_equal(begun[1], one.u)  # derivatives are taken around where the search before it ended
+    assert abs(end[0] - 0.4) < 0.05 < 0.15 < abs(one.u[0] - 0.4) and len(begun) > 3
+    begun.clear()
+    to_its_end(objective, end, 20)
+    assert len(begun) <= 2

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.errors.features import CHANNELS
 from sysid.errors.noise import Whitener
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.missing.catalogue import base_values
 from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_in_bins, load_fitted, statistics_of
 from sysid.replay.rollout import make_batch, predictions, simulate, vehicle_plant

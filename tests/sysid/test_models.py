@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from cart import cart
 
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid import fit as fit_module
 from sysid.fit import Arguments
 from sysid.logs.log import make_trial
 from sysid.logs.records import Command, OdometryStream, PoseStream
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.replay.cores import on_all_cores
 from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model

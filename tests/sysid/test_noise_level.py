@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sysid.errors.noise import fit_whitener, scatter
-from sysid.errors.noise_level import NoiseLevels, NoisyDrives, noise_levels, said, steady_bins
+from sysid.errors.noise import NoiseLevels, NoisyDrives, fit_whitener, noise_levels, said, scatter, steady_bins
 from sysid.logs.records import Command
 from sysid.missing.days import Leftover, Reference, Wander
 from sysid.missing.signatures import white_leftover

@@ -15,9 +15,8 @@ from sysid.errors.noise import fit_whitener
 from sysid.errors.normal_equations import NormalEquations, make_equations
 from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.errors.prior import Prior
-from sysid.errors.robust import huber_weight, robust_cost
-from sysid.replay.courses import CourseReplay
-from sysid.replay.differences import DifferenceReplay
+from sysid.errors.space import huber_weight, robust_cost
+from sysid.replay.differences import CourseReplay, DifferenceReplay
 from sysid.search import least_squares, starts
 
 SETS = np.array([[0.4, 0.5, 0.6], [0.6, 0.4, 0.3], [1.0, 0.45, 0.5]])

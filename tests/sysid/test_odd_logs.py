@@ -12,8 +12,8 @@ from sysid.logs.coverage import doubts, sanity
 from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
-from sysid.logs.standing import stood, without_standing
 from sysid.logs.streams import clock_shift, response_shift
+from sysid.logs.unusable import stood, without_standing
 from sysid.logs.windows import WINDOW, in_windows
 from whill_mjx.vehicle.specs import WHILL_CR
 

@@ -95,7 +95,7 @@ def test_a_log_that_says_nothing_of_steady_motion_has_no_frames():
 @pytest.mark.parametrize("period", [0.02, 0.025])
 def test_speeds_of_frames_are_means_over_them_low_passed_once_a_frame(period):
     """Against the recursion itself, as an odometry runs it, at the frames of a drive that starts in motion."""
-    from sysid.replay.odometry import framed
+    from sysid.replay.delays import framed
 
     dt, time_constant = 0.01, 0.042
     t = np.arange(400) * dt

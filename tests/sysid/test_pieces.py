@@ -14,8 +14,7 @@ from sysid.errors import bin_objective
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.replay import pieces, rollout
-from sysid.replay.courses import CourseReplay
-from sysid.replay.differences import DifferenceReplay
+from sysid.replay.differences import CourseReplay, DifferenceReplay
 from sysid.search import least_squares
 from sysid.search.valleys import from_all
 from whill_mjx.vehicle.config import VehicleConfig

@@ -18,8 +18,8 @@ from cart import cart
 from conftest import SHORT, TRUTH, unicycle_plant
 from warm_starter import Warm
 
+from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.fit import Arguments, main
-from sysid.logs.synthetic import Schedule, write_dataset
 from whill_mjx.io import steps
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.vehicle.specs import WHILL_CR

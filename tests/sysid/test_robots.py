@@ -413,6 +413,169 @@ def test_actuators_that_take_no_speed_are_replaced_and_gears_may_turn_back(tmp_p
     assert drives(load_robot(path))[0]
 
 
-def test_a_robot_on_two_wheels_alone_is_said_to_tip(tmp_path):
-    robot = load_robot(robot_file(tmp_path, *TWO))
+def test_a_robot_that_falls_over_without_its_controller_is_named_and_not_fitted(tmp_path):
+    path = robot_file(tmp_path, *TWO, base=link("base", '<box size="0.1 0.3 0.6"/>', 20.0, 0.5, origin="0 0 0.5"))
+    path.write_text(path.read_text().replace('<inertial><mass value="20.0"/>',
+                                             '<inertial><origin xyz="0 0 0.5"/><mass value="20.0"/>'))
+    robot = load_robot(path)
     assert any("two driven wheels alone" in line for line in describe_robot(robot, check_robot(robot)))
+    with pytest.raises(ValueError, match="falls over: .* balances by a controller of its own"):
+        mjcf_model(path)
+    hung = robot_file(tmp_path, *TWO, link("ball", BALL, 0.1) + joint("ball_joint", "ball", "-0.2 0 -0.05"))
+    assert not load_robot(hung).falls
+
+
+def plugin(file, **tags):
+    inside = "".join(f"<{name}>{value}</{name}>" for name, value in tags.items())
+    return f'<gazebo><plugin filename="{file}" name="drive">{inside}</plugin></gazebo>'
+
+
+ROLLING = [wheel(name, x, y) for name, x, y in
+           (("port", 0.2, 0.2), ("starboard", 0.2, -0.2), ("idle_a", -0.2, 0.2), ("idle_b", -0.2, -0.2))]
+SPEEDS = "".join(f'<joint name="{name}"><command_interface name="velocity"/></joint>' for name in ("starboard", "port"))
+GEARS = "".join(f'<transmission name="{name}"><joint name="{name}"><hardwareInterface>hardware_interface/'
+                'VelocityJointInterface</hardwareInterface></joint></transmission>' for name in ("starboard", "port"))
+
+
+@pytest.mark.parametrize("says", [
+    plugin("libgazebo_ros_diff_drive.so", leftJoint="port", rightJoint="starboard"),
+    plugin("gz-sim-diff-drive-system", left_joint="port", right_joint="starboard"),
+    f'<ros2_control name="base" type="system">{SPEEDS}</ros2_control>', GEARS,
+])  # fmt: skip
+def test_wheels_that_a_file_says_are_driven_are(tmp_path, says):
+    robot = load_robot(robot_file(tmp_path, *ROLLING, says))
+    assert [robot.host.actuator(one).name for one in robot.actuators] == ["port", "starboard"]
+
+
+def test_a_plugin_of_four_wheels_gives_their_sides(tmp_path):
+    says = plugin("libgazebo_ros_skid_steer_drive.so", leftFrontJoint="port", rightFrontJoint="starboard",
+                  leftRearJoint="idle_a", rightRearJoint="idle_b")
+    robot = load_robot(robot_file(tmp_path, *ROLLING, says))
+    assert [robot.host.actuator(one).name for one in robot.actuators] == ["port", "idle_a", "starboard", "idle_b"]
+
+
+def test_wheels_with_rollers_are_known_by_plugin_or_picture(tmp_path):
+    four = "".join(wheel(name, x, y) for name, x, y in (
+        ("fl", 0.2, 0.2), ("fr", 0.2, -0.2), ("rl", -0.2, 0.2), ("rr", -0.2, -0.2)))
+    drawn = four.replace("<collision>", '<visual><geometry><mesh filename="package://r/mecanum.stl"/></geometry>'
+                         "</visual><collision>")
+    for text in (four + plugin("libgazebo_ros_planar_move.so"), drawn):
+        assert any("mecanum or omni" in note for note in load_robot(robot_file(tmp_path, text)).notes)
+    assert not any("mecanum" in note for note in load_robot(robot_file(tmp_path, four)).notes)
+
+
+def test_tricycles_are_refused_by_the_name_of_their_steering_or_by_their_plugin(tmp_path):
+    rear = wheel("left_wheel", 0, 0.2), wheel("right_wheel", 0, -0.2)
+    fork = link("fork") + joint("steering", "fork", "0.4 0 0", "continuous", "0 0 1") + wheel(
+        "front_wheel", 0, 0, parent="fork")
+    with pytest.raises(ValueError, match="wheel front_wheel is steered by joint steering"):
+        load_robot(robot_file(tmp_path, *rear, fork))
+    assert load_robot(robot_file(tmp_path, *rear, fork.replace('"steering"', '"caster_steering"'))).wheels
+    with pytest.raises(ValueError, match="plugin libgazebo_ros_ackermann_drive.so steers its wheels"):
+        load_robot(robot_file(tmp_path, *rear, plugin("libgazebo_ros_ackermann_drive.so")))
+
+
+def test_a_track_of_many_wheels_drives_as_one_side(tmp_path):
+    names = [(f"{side}_track_wheel_{k}", -0.2 + 0.1 * k, y) for side, y in (("left", 0.2), ("right", -0.2))
+             for k in range(5)]
+    robot = load_robot(robot_file(tmp_path, *(wheel(*one, CYLINDER.replace("0.1", "0.05")) for one in names)))
+    assert len(robot.wheels) == 10 and drives(robot)[0]
+
+
+@pytest.mark.parametrize(("parts", "said"), [
+    ([*ROLLING, link("port_link")], "link 'port_link' is there twice"),
+    ([joint("left_wheel", "nowhere", "0 0 0", "continuous")], "child of joint 'left_wheel' is link 'nowhere', which"),
+    ([link(f"foot_{k}") + joint(f"knee_{k}", f"foot_{k}", f"0 {k} 0", "revolute", more=(
+        '<limit lower="-1" upper="1" effort="9" velocity="9"/>')) for k in (-1, 1)], "all joints end within a turn"),
+])  # fmt: skip
+def test_a_file_that_is_no_robot_on_wheels_says_why(tmp_path, parts, said):
+    with pytest.raises(ValueError, match=said):
+        load_robot(robot_file(tmp_path, *parts))
+
+
+def test_a_robots_own_name_shows_no_side(tmp_path):
+    robot = load_robot(robot_file(tmp_path, wheel("r1_wheel_r", 0, -0.2), wheel("r1_wheel_l", 0, 0.2)))
+    assert [robot.host.actuator(one).name for one in robot.actuators] == ["r1_wheel_l", "r1_wheel_r"]
+
+
+@pytest.mark.parametrize(("leader", "said"), [
+    ("left_finger_joint", ""), ("thumb", "mimics thumb, which the file lacks")])
+def test_a_gripper_whose_fingers_follow_each_other_is_held(tmp_path, leader, said):
+    fingers = "".join(
+        link(f"{side}_finger", mass=0.01) + joint(f"{side}_finger_joint", f"{side}_finger", "0 0 0.3", "prismatic",
+                                                  more=END) for side in ("left", "right"))
+    fingers = fingers[::-1].replace("</joint>"[::-1], f'<mimic joint="{leader}"/></joint>'[::-1], 1)[::-1]
+    robot = load_robot(robot_file(tmp_path, *TWO, fingers))
+    assert drives(robot)[0] and robot.host.neq == 0 and said in " ".join(robot.notes)
+
+
+def test_a_caster_that_is_only_drawn_carries_its_robot(tmp_path):
+    seen = link("caster", BALL, 0.1).replace("collision>", "visual>")
+    robot = load_robot(robot_file(tmp_path, *TWO, seen, joint("caster_joint", "caster", "-0.2 0 -0.05")))
+    assert any("link caster has no collision shape" in note for note in robot.notes)
+    assert robot.host.geom_contype[robot.host.geom("caster").id] | robot.host.geom_conaffinity[
+        robot.host.geom("caster").id]
+
+
+CAR = """<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="5 5 0.1" name="floor"/>
+  <body name="car" pos="0 0 0.03"><freejoint/><geom type="box" size="0.08 0.05 0.01" mass="0.5"/>
+    <geom name="ball" type="sphere" size="0.015" pos="0.08 0 -0.015" condim="1" priority="1" mass="0.01"/>
+    <body pos="-0.05 0.06 0"><joint name="left" axis="0 1 0" damping="0.03"/>
+      <geom type="cylinder" size="0.03 0.01" zaxis="0 1 0" mass="0.05"/></body>
+    <body pos="-0.05 -0.06 0"><joint name="right" axis="0 1 0" damping="0.03"/>
+      <geom type="cylinder" size="0.03 0.01" zaxis="0 1 0" mass="0.05"/></body></body>OTHERS</worldbody>
+  <tendon><fixed name="ahead"><joint joint="left" coef="0.5"/><joint joint="right" coef="0.5"/></fixed></tendon>
+  <actuator>ACTS</actuator>MORE</mujoco>"""
+TENDON = '<motor name="ahead" tendon="ahead"/>'
+FILTER = "".join(f'<general joint="{side}" dyntype="filter" dynprm="0.05" gainprm="2" biastype="affine" '
+                 'biasprm="0 0 -2"/>' for side in ("left", "right"))
+SERVOS = '<velocity joint="left" kv="0.01"/><velocity joint="right" kv="0.01"/>'
+
+
+def car_file(folder, acts, others="", more=""):
+    path = folder / "car.xml"
+    path.write_text(CAR.replace("ACTS", acts).replace("OTHERS", others).replace("MORE", more))
+    return path
+
+
+@pytest.mark.parametrize(("acts", "said"), [
+    (TENDON, "actuator ahead acts on tendon ahead"), (FILTER, "has a filter or a muscle"),
+    (FILTER.replace('dyntype="filter" dynprm="0.05" ', 'gaintype="affine" '), "pulls by a law of its own")])
+def test_servos_that_stand_in_for_other_actuators_reach_their_speed_whatever_the_bearing(tmp_path, acts, said):
+    sensor = '<sensor><actuatorfrc actuator="ahead"/></sensor>' if acts == TENDON else ""
+    robot = load_robot(car_file(tmp_path, acts, more=sensor))
+    straight, check = drives(robot)
+    assert straight and check.speed == pytest.approx(check.command[0], rel=0.02)
+    assert said in " ".join(robot.notes) and "friction and damping of joint left" in " ".join(robot.notes)
+
+
+def test_a_servo_that_its_bearing_holds_back_is_named(tmp_path):
+    robot = load_robot(car_file(tmp_path, SERVOS))
+    lines = "\n".join(describe_robot(robot, check_robot(robot)))
+    assert "held back by a damping of 0.03 of joint left: it reaches 25% of its speed" in lines
+
+
+def test_keyframes_of_the_file_do_not_hinder_what_is_added(tmp_path):
+    key = '<keyframe><key name="home" qpos="0 0 0.03 1 0 0 0 0 0" ctrl="0 0"/></keyframe>'
+    assert load_robot(car_file(tmp_path, SERVOS, more=key), regulated=True).integrals
+
+
+def test_what_stands_or_rolls_aside_carries_nothing_and_hinders_nothing(tmp_path):
+    aside = ('<geom name="post" type="cylinder" size="0.2 0.4" pos="-3 1 0.4"/>'
+             '<body pos="2 0 0.1"><freejoint/><geom name="toy" type="sphere" size="0.1"/></body>')
+    path = car_file(tmp_path, SERVOS, aside)
+    path.write_text(path.read_text().replace(' damping="0.03"', ""))
+    robot = load_robot(path)
+    straight, check = drives(robot)
+    assert "the obstacle's contacts are left out" in " ".join(robot.notes) and "toy" not in check.loads and straight
+    with pytest.raises(ValueError, match="MJX has no contact between"):
+        load_robot(car_file(tmp_path, SERVOS, '<geom type="cylinder" size="2 0.01" pos="0 0 -0.01"/>'))
+
+
+def test_what_drags_on_the_floor_is_named_with_its_friction(tmp_path):
+    path = car_file(tmp_path, SERVOS)
+    text = path.read_text().replace('condim="1" priority="1"', 'friction="0 0 0"')
+    path.write_text(text.replace("0.08 0 -0", "0.02 0 -0"))
+    robot = load_robot(path)
+    assert any('ball slides on the floor with a friction of 1 ' in line
+               for line in describe_robot(robot, check_robot(robot)))

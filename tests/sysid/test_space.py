@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.planted_logs import Schedule, fitted_plant, write_dataset
 from sysid.errors.space import RATIO, Space, make_space, searched
 from sysid.logs.log import load_log
-from sysid.logs.synthetic import Schedule, write_dataset
 from sysid.replay.differences import make_replay
 from sysid.replay.models import measured_effects, with_effects
-from sysid.search.fitting import fitted_plant
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR, find_spec, in_proportion

@@ -10,8 +10,16 @@ from sysid.errors.features import BIN
 from sysid.errors.noise import Whitener
 from sysid.errors.space import make_space
 from sysid.follow_up.unnamed import UnnamedReplays, as_report, fit_unnamed, tables, vehicle_of, with_start_angles
-from sysid.follow_up.wrench_tables import Products, WrenchTable, few_terms, gains_without, shift
-from sysid.follow_up.wrench_terms import Term, columns_of, in_words
+from sysid.follow_up.wrench_tables import (
+    Products,
+    Term,
+    WrenchTable,
+    columns_of,
+    few_terms,
+    gains_without,
+    in_words,
+    shift,
+)
 from sysid.logs.manoeuvre_library import make_command
 from sysid.logs.records import OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import base_values

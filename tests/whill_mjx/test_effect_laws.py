@@ -195,6 +195,14 @@ def test_dry_friction_opposes_motion_and_is_larger_near_rest(v, expected):
 
 
 @quick
+def test_dry_friction_of_small_slow_wheels_is_as_sharp_as_that_of_large_ones():
+    effect, large = make_effect("dry_friction", coulomb=8.0), motion_at(0.03)
+    slow = replace(large, wheel_radius=large.wheel_radius / 4, contact_vx=large.contact_vx / 4)
+    np.testing.assert_allclose(effect.force((), slow)[1].fx, effect.force((), large)[1].fx, rtol=1e-6)
+    assert abs(effect.force((), replace(slow, wheel_radius=large.wheel_radius))[1].fx) < 6.0
+
+
+@quick
 def test_dry_friction_resists_turning_at_the_arm_of_the_driven_wheels():
     _, wrench = make_effect("dry_friction", coulomb=8.0).force((), motion_at(omega=1.0))
     np.testing.assert_allclose(wrench.tz, -2 * 8 * 0.248, rtol=1e-3)

@@ -142,6 +142,8 @@ ONE_OPERATOR = (  # with its attributes, and the constants after the first input
     ("Flatten", {"axis": 0}, ()),
     ("CastLike", {}, (np.zeros(1, np.float32),)), ("Tile", {}, (np.array([2, 1]),)),
     ("Mod", {"fmod": 1}, (np.array([0.7], np.float32),)), ("ReduceProd", {"keepdims": 0}, (np.array([1]),)),
+    ("ReduceL1", {}, (np.array([1]),)), ("ReduceL2", {"keepdims": 0}, (np.array([0]),)),
+    ("ReduceLogSumExp", {}, (np.array([0, 1]),)), ("ReduceSumSquare", {}, (np.array([1]),)),
     ("LayerNormalization", {"epsilon": 1e-3}, (np.arange(4, dtype=np.float32), np.ones(4, np.float32))),
     ("BatchNormalization", {}, tuple(np.arange(1, 5, dtype=np.float32) * k for k in (1, 2, 3, 4))),
 )  # fmt: skip

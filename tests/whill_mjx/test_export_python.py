@@ -68,6 +68,13 @@ def test_the_name_of_a_vehicle_stays_text():
     assert space["NAME"] == name
 
 
+def test_a_limit_that_is_not_there_is_infinite_in_the_file_too():
+    spec, params = with_effects("whill_cr", [make_effect("acceleration_limit", wheel=2.0)])
+    space: dict = {}
+    exec(vehicle_source(spec, params), space)
+    assert space["PARAMETERS"]["acceleration_limit.linear"] == (np.inf, "m/s^2")
+
+
 def test_many_vehicles_at_once_drive_as_one_by_one(exported):
     start, step, pose = (exported[3][name] for name in ("start", "step", "pose"))
     yaw, v = np.array([0.0, 1.0]), np.array([0.5, -0.3])

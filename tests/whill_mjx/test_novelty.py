@@ -1,5 +1,6 @@
 """Surprise: beliefs that contradict one another raise it, and those of a vehicle that drives do not."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -59,3 +60,35 @@ def test_limits_are_those_of_ordinary_episodes_and_rise():
     assert (slow, stop) == pytest.approx((0.9, 0.99))
     slow, stop = limits(np.full(5, 0.2))
     assert 0 < slow < stop
+
+
+def test_the_exported_network_of_a_watched_policy_is_one_that_evaluations_compile():
+    """Its file is what `whill_mjx.evaluate` reads."""
+    from dreamer.network import Network as Exported
+    from dreamer.network import parity, to_onnx
+    from whill_mjx.evaluation.onnx_network import Network
+
+    def step(weights, carry, image):
+        mean = jnp.mean(image.astype(jnp.float32)) / 255.0
+        return {"seen": carry["seen"] + mean}, jnp.tanh(jnp.stack([mean, -mean]))
+
+    act, carry = watched(step, {"seen": jnp.zeros(1)}, SECONDS, lambda _, carry: jnp.concatenate([carry["seen"]] * 4))
+    shapes = {name: jax.ShapeDtypeStruct(value.shape, jnp.float32) for name, value in carry.items()}
+
+    def named(carry, obs):
+        carry, action = act(None, carry, obs["image"])
+        return carry, (action,)
+
+    exported = Exported(named, shapes, {"image": jax.ShapeDtypeStruct((8, 8, 3), jnp.uint8)})
+    data = to_onnx(exported)
+    assert parity(data, exported, 5)["max_abs_action_difference"] < 1e-5
+    image = np.full((8, 8, 3), 51, np.uint8)
+    given = [image, *(np.ones(shape.shape, np.float32) for shape in shapes.values())]
+    for ours, theirs in zip(jax.jit(Network(data))(*given), _in_order(act, given, shapes), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def _in_order(act, given, shapes):
+    """Outputs of a step in the order of the file: the action, and the carry by name."""
+    carry, action = act(None, dict(zip(shapes, given[1:], strict=True)), given[0])
+    return [action, *(carry[name] for name in shapes)]

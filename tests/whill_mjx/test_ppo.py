@@ -18,6 +18,7 @@ from whill_mjx.learning.ppo import (
     ReturnScale,
     Rollout,
     advantages,
+    empty_frames,
     init_state,
     iterate,
     policy_carry,
@@ -197,3 +198,46 @@ def test_another_setting_of_the_baseline_is_refused_on_resuming(tmp_path):
 def test_settings_that_cannot_be_meant_are_refused(wrong):
     with pytest.raises(ValueError, match=f"PpoConfig: {next(iter(wrong))} is .*; it must"):
         PpoConfig(**wrong)
+
+
+SENSING = dataclasses.replace(TINY, readings=3, scan=16)
+SHAPES = {"camera": (8, 8, 3), "goal": (2,), "lidar": (16,)}
+
+
+def sensed(rng, count):
+    """Observations of `count` instances, with an image, a vector and a scan."""
+    image = rng.integers(0, 256, (count, 8, 8, 3), dtype=np.uint8)
+    return {"camera": image, **{name: rng.normal(size=(count, *SHAPES[name])).astype(np.float32)
+                                for name in ("goal", "lidar")}}  # fmt: skip
+
+
+@pytest.mark.quick
+def test_scans_and_vectors_are_remembered_and_an_episode_begins_with_copies_of_the_first():
+    first, second = (sensed(np.random.default_rng(seed), 2) for seed in (0, 1))
+    frames = push(empty_frames(SENSING, SHAPES, (2,)), first, jnp.array([True, True]))
+    np.testing.assert_array_equal(frames["vector"], np.tile(first["goal"], 3))
+    frames = push(frames, second, jnp.array([False, True]))
+    np.testing.assert_array_equal(frames["vector"][0], np.concatenate([first["goal"][0]] * 2 + [second["goal"][0]]))
+    np.testing.assert_array_equal(frames["scan"][0], np.stack([first["lidar"][0]] * 2 + [second["lidar"][0]], -1))
+    np.testing.assert_array_equal(frames["scan"][1], np.stack([second["lidar"][1]] * 3, -1))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("config", [TINY, SENSING, dataclasses.replace(SENSING, scan=0)])
+def test_the_exported_step_remembers_what_the_network_was_trained_on(config):
+    empty = empty_frames(config, SHAPES, (1,))
+    params = Network(config, 2).init(jax.random.key(0), empty)
+    params["params"]["Dense_1"]["kernel"] *= 1e2  # a new network's actions are all near zero
+    carry, frames, rng = policy_carry(config, SHAPES), empty, np.random.default_rng(0)
+    for count in range(4):
+        obs = sensed(rng, 1)
+        carry, action = policy_step(config, params, carry, {name: value[0] for name, value in obs.items()})
+        frames = push(frames, obs, jnp.array([count == 0]))
+        expected = jnp.clip(Network(config, 2).apply(params, frames)[0][0], -1.0, 1.0)
+        np.testing.assert_allclose(action, expected, atol=1e-5)
+
+
+@pytest.mark.quick
+def test_scans_of_several_lengths_are_refused():
+    with pytest.raises(ValueError, match="one length"):
+        empty_frames(SENSING, {"front": (16,), "rear": (20,)}, (1,))

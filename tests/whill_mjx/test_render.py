@@ -148,3 +148,20 @@ def test_more_boxes_than_labels_are_refused():
 def test_reciprocal_without_division_is_right_to_single_precision():
     x = jnp.concatenate([jnp.logspace(-14, 6, 2000), -jnp.logspace(-14, 6, 2000)])
     np.testing.assert_allclose(reciprocal(x) * x, 1.0, rtol=5e-7)
+
+
+def test_images_are_drawn_inside_a_loop_of_many_instances():
+    """As evaluations do it: each instance has its own loop, and all of them have the same weights."""
+    scene = random_scene(jax.random.key(5))
+
+    def drive(weight, start):
+        def one(place, _):
+            image = render(jnp.array([place, 0.0, 1.0]), LEVEL, LENS, scene)
+            return place + weight * jnp.mean(image) / 255, image
+
+        return jax.lax.scan(one, start, None, length=2)[1]
+
+    images = jax.jit(jax.vmap(drive, in_axes=(None, 0)))(0.1, jnp.array([0.0, 0.3]))
+    for index, place in enumerate((0.0, 0.3)):
+        first = jax.jit(render)(jnp.array([place, 0.0, 1.0]), LEVEL, LENS, scene)
+        np.testing.assert_array_equal(images[index, 0], first)

@@ -1,6 +1,7 @@
 """Rich looks: one record per world, drawn inside the reset, that changes what is seen and leaves a way through."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,9 @@ from whill_mjx.env import RICH, make_env, observe, repainted, reset_state
 from whill_mjx.tasks.tasks import make_task, sample_world
 from whill_mjx.world.eye import develop, plain_eye
 from whill_mjx.world.render import camera_rotation, pinhole, render
-from whill_mjx.world.render.pallas import Tiling, render_pallas
+from whill_mjx.world.render.pallas import Tiling, fast_whole, render_pallas
+from whill_mjx.world.render.rich import NUMBERS, Surface, _paint
+from whill_mjx.world.render.textures import whole
 from whill_mjx.world.rich import PASSAGE, furnish, paint, roles_of
 
 SIZE = 16
@@ -76,6 +79,26 @@ def test_things_never_close_the_passage(task):
                 free, reached = max(free, start - reached), max(reached, end)
             assert free > 0.9 and PASSAGE > 0.9, (world, x, free)
     assert seen > 100
+
+
+def test_the_cells_of_a_material_are_the_same_where_a_gpu_rounds_down_by_a_sum():
+    """Eagerly: XLA would merge the sums."""
+    rng = np.random.default_rng(0)
+    numbers = rng.uniform(0.2, 3.0, NUMBERS).astype(np.float32)
+    place = [jnp.asarray(rng.uniform(-4, 4, 500), jnp.float32) for _ in range(3)]
+    rows = [jnp.float32(value) for value in rng.uniform(-1, 1, 18)]
+    label = jnp.asarray(rng.integers(0, 30, 500))
+    surface = Surface(rows, [jnp.float32(value) for value in numbers], label, place, jnp.float32(0.01))
+
+    def paint_by(whole):
+        small = lambda integer: integer.astype(jnp.float32)  # noqa: E731
+        stage = SimpleNamespace(whole=whole, small=small, ratio=lambda x, y: x / y)
+        return _paint(stage, surface, jnp.uint32(7))
+
+    (exact, tones), (fast, other) = paint_by(whole), paint_by(fast_whole)
+    np.testing.assert_array_equal(exact, fast)
+    np.testing.assert_array_equal(tones, other)
+    assert np.std(tones) > 0.05
 
 
 @pytest.mark.long

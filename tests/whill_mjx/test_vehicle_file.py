@@ -11,6 +11,7 @@ import pytest
 
 from sysid.replay.models import with_effects
 from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.vehicle.dynamics import place, substep
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.vehicle.model import build_model
 from whill_mjx.vehicle.presets import preset, preset_params
@@ -184,10 +185,47 @@ def test_a_file_without_a_model_drives_by_the_base_model_for_its_size(tmp_path):
     path.write_text(SHORT)
     spec, params, _ = load_vehicle(path)
     assert spec.camera.yaw == 0.5 and spec.camera.y == 0.01
-    jax.tree.map(np.testing.assert_array_equal, params, preset_params(spec, "physical"))
+    usual = preset_params(spec, "physical")
+    kept = VehicleParams(params.body, tuple(one for one in params.effects if one.name != "suspension"))
+    jax.tree.map(np.testing.assert_array_equal, kept, usual)
     path.write_text(SHORT.replace("[spec]", 'base = "paper"\n[spec]'))
     assert load_vehicle(path)[1].effects[0].name == "pid_drive"
     assert load_intervals(path) == {}
+
+
+def test_what_a_short_file_leaves_out_is_in_proportion_to_its_size(tmp_path):
+    path = tmp_path / "burger.toml"
+    path.write_text("".join(line + "\n" for line in SHORT.partition("[spec.camera]")[0].splitlines()
+                            if not line.startswith("body_")))
+    spec = load_vehicle(path)[0]
+    assert spec.body_length < 0.2 and spec.body_width < 0.2 and spec.camera.z < 0.2 and abs(spec.camera.x) < 0.1
+    assert spec.wheel_inertia < spec.mass * spec.wheel_radius**2
+
+
+def after(spec, params, command, seconds):
+    """Pitch [rad] and yaw rate [rad/s] when a vehicle has driven by one command from rest."""
+    model = build_model(spec)
+    commands = jnp.broadcast_to(jnp.asarray(command), (round(seconds / model.config.physics_dt), 2))
+    state = jax.jit(lambda start: jax.lax.scan(lambda at, given: (substep(model, params, at, given), None), start,
+                                               commands)[0])(place(model, params, 0.0, 0.0, 0.0))
+    w, x, y, z = np.asarray(state.qpos[3:7])
+    return float(np.arcsin(2 * (w * y - z * x))), float(state.odometry.omega)
+
+
+def test_a_small_robot_of_a_short_file_stands_upright(tmp_path):
+    path = tmp_path / "burger.toml"
+    path.write_text(SHORT)
+    spec, params, _ = load_vehicle(path)
+    assert abs(after(spec, params, (0.0, 0.0), 1.0)[0]) < np.radians(1.0)
+
+
+def test_the_wheels_of_a_skid_drive_of_a_short_file_turn_as_commanded(tmp_path):
+    path = tmp_path / "rover.toml"
+    sizes = {"wheel_radius": 0.1651, "track": 0.5708, "wheelbase": 0.512, "mass": 50.0, "omega_max": 2.0}
+    path.write_text('schema = 1\nkind = "micromobility-vehicle"\n[spec]\nname = "rover"\ndrive = "skid"\n'
+                    + "".join(f"{name} = {value}\n" for name, value in sizes.items()))
+    spec, params, _ = load_vehicle(path)
+    assert after(spec, params, (0.5, 0.6), 8.0)[1] == pytest.approx(0.6, rel=0.05)
 
 
 @pytest.mark.parametrize(("text", "said"), [

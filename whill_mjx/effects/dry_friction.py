@@ -8,13 +8,13 @@ from flax import struct
 
 from whill_mjx.effects.base import Effect, contact_wrench, driven_mean, side_forces
 from whill_mjx.effects.card import SAME_ALL_DRIVE, SAME_AT_ANY_SPEED, SAME_BACKWARD, Axis, Card, Variant
-from whill_mjx.effects.smooth import REST_SPEED, soft_sign
+from whill_mjx.effects.smooth import REST_SPIN, soft_sign
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 
 @struct.dataclass
 class DryFriction(Effect):
-    """F = -(F_c + F_e exp(-(v / v_s)^2)) tanh(v / v_0) at the driven contacts of each side, v_0 = 0.02 m/s.
+    """F = -(F_c + F_e exp(-(v / v_s)^2)) tanh(v / v_0) at the driven contacts of each side, v_0 = r 0.15 rad/s.
 
     It is a force on the ground contact, not a torque on the wheel, because the paper's drive has no wheel speeds of its
     own. Without slip both are the same. The smooth sign lets a pushed vehicle creep instead of stick.
@@ -36,5 +36,5 @@ class DryFriction(Effect):
         """Wrench of the friction at the driven contacts."""
         speed = driven_mean(motion, motion.contact_vx)
         size = self.coulomb + self.excess * jnp.exp(-jnp.square(speed / self.stribeck_speed))
-        friction = -size * soft_sign(speed, REST_SPEED)
+        friction = -size * soft_sign(speed, REST_SPIN * motion.wheel_radius)
         return memory, contact_wrench(motion, side_forces(motion, friction), jnp.zeros(4))

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect, contact_wrench
-from whill_mjx.effects.smooth import REST_SPEED, soft_sign
+from whill_mjx.effects.smooth import REST_SPIN, soft_sign
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 
 @struct.dataclass
 class RollingResistance(Effect):
-    """F = -mu_r N tanh(v / v0) at each contact, smooth at rest. Source: reference paper, Table II."""
+    """F = -mu_r N tanh(v / v_0) at each contact, v_0 = r 0.15 rad/s. Source: reference paper, Table II."""
 
     name = "rolling_resistance"
     typical = {"mu_r": (0.002, 0.015)}
@@ -22,5 +22,5 @@ class RollingResistance(Effect):
 
     def force(self, memory: tuple[()], motion: Motion) -> tuple[tuple[()], Wrench]:
         """Wrench of the losses at the four contacts."""
-        loss = -self.mu_r * motion.normal_force * soft_sign(motion.contact_vx, REST_SPEED)
+        loss = -self.mu_r * motion.normal_force * soft_sign(motion.contact_vx, REST_SPIN * motion.wheel_radius)
         return memory, contact_wrench(motion, loss, jnp.zeros(4))

@@ -9,7 +9,10 @@ import jax.numpy as jnp
 
 from whill_mjx.vehicle.types import Drive, Yielding
 
-REST_SPEED = 0.02  # [m/s] width over which forces change their sign at rest
+REST_SPEED = 0.02  # [m/s] width over which sizes of a speed are smooth at rest
+REST_SPIN = 0.02 / 0.1325
+"""Spin of a wheel over which forces at it change their sign at rest [rad/s]: a small robot drives as a chair does, but
+slower, so a width in m/s would make its dry friction a viscous one."""
 REST_RATE = 0.05  # [rad/s] width over which torques change their sign at rest
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect, driven_mean, yaw_rate
-from whill_mjx.effects.smooth import REST_RATE, REST_SPEED, soft_sign
+from whill_mjx.effects.smooth import REST_RATE, REST_SPIN, soft_sign
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 KNOTS = 12
@@ -133,7 +133,8 @@ class Unnamed(Effect):
         forces = jnp.stack([getattr(self, f"force_{k}") for k in range(1, KNOTS + 1)])
         torques = jnp.stack([getattr(self, f"torque_{k}") for k in range(1, KNOTS + 1)])
         force, torque = (weights * forces).sum(), (weights * torques).sum()
-        sides = 1 + self.with_motion * (soft_sign(driven_mean(motion, motion.contact_vx), REST_SPEED) - 1)
+        ahead = soft_sign(driven_mean(motion, motion.contact_vx), REST_SPIN * motion.wheel_radius)
+        sides = 1 + self.with_motion * (ahead - 1)
         turning = 1 + self.with_motion * (soft_sign(seen[2], REST_RATE) - 1)
         wrench = replace(Wrench.zero(), fx=force * sides.mean(),
                          tz=torque * turning + force * (sides[1] - sides[0]) * motion.track / 4)
@@ -148,6 +149,6 @@ def span_of(low: jax.Array, high: jax.Array) -> jax.Array:
 def _advanced(memory: UnnamedMemory, motion: Motion) -> UnnamedMemory:
     """Memory one physics step on."""
     rolling = jnp.abs(motion.spin).mean() * motion.wheel_radius
-    moves = jnp.where(rolling < REST_SPEED, 0.0, 1.0)
+    moves = jnp.where(rolling < REST_SPIN * motion.wheel_radius, 0.0, 1.0)
     return UnnamedMemory(memory.time + motion.dt, memory.angle + motion.spin * motion.dt,
                          moves * (memory.moving + motion.dt), moves * (memory.distance + rolling * motion.dt))

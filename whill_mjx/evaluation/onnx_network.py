@@ -87,13 +87,17 @@ def _folded(name: str) -> Operator:
     return fold
 
 
-def _reduction(name: str) -> Operator:
+def _reduction(name: str, before: str = "", after: str = "") -> Operator:
+    """Along axes: a function of NumPy by name, of values and with a result that others are applied to."""
+
     def reduce(xp, attributes, count, values, axes=None):
         axes = axes if axes is not None else attributes.get("axes")
         if axes is None and attributes.get("noop_with_empty_axes", 0):
             return values
         axis = None if axes is None else _ints(axes)
-        return getattr(xp, name)(values, axis=axis, keepdims=bool(attributes.get("keepdims", 1)))
+        values = getattr(xp, before)(values) if before else values
+        found = getattr(xp, name)(values, axis=axis, keepdims=bool(attributes.get("keepdims", 1)))
+        return getattr(xp, after)(found) if after else found
 
     return reduce
 
@@ -283,11 +287,16 @@ OPERATORS: dict[str, Operator] = {
     "Pow": _elementwise("power"),
     "Range": _range,
     "Reciprocal": lambda xp, a, count, value: 1 / value,
+    "ReduceL1": _reduction("sum", before="abs"),
+    "ReduceL2": _reduction("sum", before="square", after="sqrt"),
+    "ReduceLogSum": _reduction("sum", after="log"),
+    "ReduceLogSumExp": _reduction("sum", before="exp", after="log"),
     "ReduceMax": _reduction("max"),
     "ReduceMean": _reduction("mean"),
     "ReduceMin": _reduction("min"),
     "ReduceProd": _reduction("prod"),
     "ReduceSum": _reduction("sum"),
+    "ReduceSumSquare": _reduction("sum", before="square"),
     "Relu": lambda xp, a, count, value: xp.maximum(value, 0),
     "Reshape": _reshape,
     "Round": _elementwise("rint"),

@@ -23,7 +23,8 @@ from whill_mjx.io.fields import Field, check_fields
 
 PPO = (
     *(Field(name, kind="whole", low=1, high=10**6) for name in ("width", "rollout", "epochs", "minibatches")),
-    Field("stack", kind="whole", low=1, high=1000),
+    *(Field(name, kind="whole", low=1, high=1000) for name in ("stack", "readings")),
+    Field("scan", kind="whole", low=0, high=10**6),
     Field("channels", kind="wholes", low=1, high=10**6, count=3),
     Field("lr", low=1e-12, high=1.0),
     *(Field(name, low=1e-9, high=1e6) for name in ("clip", "max_grad_norm")),
@@ -40,6 +41,11 @@ class PpoConfig:
 
     stack: int = 3
     """Frames that the network sees, the newest last."""
+    readings: int = 1
+    """Readings of the vectors that it sees, the newest last. From one scan nobody knows who walks where."""
+    scan: int = 0
+    """Numbers from which a vector counts as a scan, which the network sees through convolutions over its rays; 0: none
+    does. Scans must have one length, since their readings are the channels."""
     width: int = 256
     """Units of the layer after the convolutions."""
     channels: tuple[int, int, int] = (32, 64, 64)
@@ -74,8 +80,8 @@ class PpoConfig:
 class Network(nn.Module):
     """Mean of the action, and value, of stacked frames (..., H, W, C * stack) uint8.
 
-    Where an environment shows vectors too, or only them, the input is a dict of "frames" and "vector" (..., D), either
-    of which may be absent; vectors are squeezed by symlog.
+    Where an environment shows vectors too, or only them, the input is a dict of "frames", "scan" (..., R, readings) and
+    "vector" (..., D * readings), each of which may be absent; scans and vectors are squeezed by symlog.
     """
 
     config: PpoConfig
@@ -87,6 +93,8 @@ class Network(nn.Module):
         if not isinstance(frames, Mapping):
             return self._heads(self._see(frames))
         parts = [self._see(frames["frames"])] if "frames" in frames else []
+        if "scan" in frames:
+            parts.append(self._feel(frames["scan"]))
         if "vector" in frames:
             vector = symlog(frames["vector"])
             parts.append(nn.tanh(nn.Dense(self.config.width, kernel_init=orthogonal(2**0.5))(vector)))
@@ -98,6 +106,13 @@ class Network(nn.Module):
         for channels, kernel, stride in zip(self.config.channels, (8, 4, 3), (4, 2, 1), strict=True):
             convolution = nn.Conv(channels, (kernel, kernel), (stride, stride), kernel_init=orthogonal(2**0.5))
             x = nn.relu(convolution(x))
+        return x.reshape((*x.shape[:-3], -1))
+
+    def _feel(self, scan: jax.Array) -> jax.Array:
+        """(..., D) features of scans (..., R, readings), by convolutions that see a row of an image one pixel high."""
+        x = symlog(scan)[..., None, :, :]
+        for channels, kernel in zip(self.config.channels, (7, 5, 3), strict=True):
+            x = nn.relu(nn.Conv(channels, (1, kernel), (1, 2), kernel_init=nn.initializers.orthogonal(2**0.5))(x))
         return x.reshape((*x.shape[:-3], -1))
 
     def _heads(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -162,27 +177,58 @@ class Rollout:
     used: jax.Array  # (T, N) bool: the action was not ignored by a reset
 
 
+def rays_of(config: PpoConfig, obs_shape: Mapping[str, Any]) -> int:
+    """Length of the vectors that count as scans; 0 where none does.
+
+    Raises:
+        ValueError: their lengths differ.
+    """
+    long = {name: shape[0] for name, shape in obs_shape.items() if len(shape) == 1 and 0 < config.scan <= shape[0]}
+    if len(set(long.values())) > 1:
+        raise ValueError(f"scan = {config.scan}: scans need one length, and {long} have several. Change the sensors.")
+    return next(iter(long.values()), 0)
+
+
+def parted(obs: Mapping[str, Any], rays: int) -> dict[str, jax.Array]:
+    """What is there of "frames" (..., H, W, C), "scan" (..., R, K) and "vector" (..., D): all of a kind joined."""
+    scans = {name: value for name, value in obs.items() if value.shape[-1] == rays and value.dtype != jnp.uint8}
+    rest = {name: value for name, value in obs.items() if name not in scans}
+    parts = {"frames": spaces.image_of(rest), "vector": spaces.vector_of(rest)}
+    if scans:
+        parts["scan"] = jnp.stack([scans[name] for name in sorted(scans)], -1)
+    return {name: value for name, value in parts.items() if value is not None}
+
+
 def push(frames: Any, obs: Any, first: jax.Array) -> Any:
     """Stacked frames (N, H, W, C * stack) with `obs` (N, H, W, C) as the newest; before a first frame all is black.
 
-    Of a dict of observations the images are stacked, joined along their channels, and the vectors are the newest.
+    Of a dict of observations each kind is stacked along its last axis. Before a first scan or vector, all are like it.
     """
     if isinstance(obs, Mapping):
-        image, vector = spaces.image_of(obs), spaces.vector_of(obs)
-        pushed = {} if image is None else {"frames": push(frames["frames"], image, first)}
-        return pushed if vector is None else {**pushed, "vector": vector}
+        parts = parted(obs, frames["scan"].shape[-2] if "scan" in frames else 0)
+        return {kind: push(frames[kind], new, first) if kind == "frames" else remember(frames[kind], new, first)
+                for kind, new in parts.items()}  # fmt: skip
     kept = jnp.where(first[:, None, None, None], jnp.uint8(0), frames[..., obs.shape[-1] :])
     return jnp.concatenate([kept, obs], axis=-1)
 
 
-def empty_frames(config: PpoConfig, obs_shape: Any, batch: tuple[int, ...], stack: int) -> Any:
-    """What `push` begins with: `stack` black images, and vectors of zeros."""
+def remember(readings: jax.Array, new: jax.Array, first: jax.Array) -> jax.Array:
+    """Readings (N, ..., D * readings) with `new` (N, ..., D) as the newest; a first one stands for those before too."""
+    size = new.shape[-1]
+    begun = jnp.concatenate([new] * (readings.shape[-1] // size), -1)
+    first = first.reshape(-1, *[1] * (new.ndim - 1))
+    return jnp.where(first, begun, jnp.concatenate([readings[..., size:], new], -1))
+
+
+def empty_frames(config: PpoConfig, obs_shape: Any, batch: tuple[int, ...]) -> Any:
+    """What `push` begins with: black images, and scans and vectors of zeros."""
     if not isinstance(obs_shape, Mapping):
         height, width, channels = obs_shape
-        return jnp.zeros((*batch, height, width, channels * stack), jnp.uint8)
-    pixels, size = spaces.image_shape(obs_shape), spaces.vector_size(obs_shape)
-    empty = {"frames": empty_frames(config, pixels, batch, stack)} if pixels else {}
-    return {**empty, "vector": jnp.zeros((*batch, size))} if size else empty
+        return jnp.zeros((*batch, height, width, channels * config.stack), jnp.uint8)
+    seen = jax.eval_shape(lambda: parted(spaces.zeros(obs_shape, batch), rays_of(config, obs_shape)))
+    depth = {"frames": config.stack}
+    return {kind: jnp.zeros((*one.shape[:-1], one.shape[-1] * depth.get(kind, config.readings)), one.dtype)
+            for kind, one in seen.items()}  # fmt: skip
 
 
 def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
@@ -194,7 +240,7 @@ def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
     check_minibatches(config, env.num_envs)
     env_key, net_key, key = jax.random.split(jax.random.key(seed), 3)
     env_state, step = env.reset(env_key)
-    empty = empty_frames(config, env.obs_shape, (env.num_envs,), config.stack)
+    empty = empty_frames(config, env.obs_shape, (env.num_envs,))
     params = Network(config, env.action_dim).init(net_key, empty)
     zero = jnp.zeros(())
     scale = ReturnScale(jnp.zeros(env.num_envs), zero, zero, zero)
@@ -346,26 +392,34 @@ def policy_step(
     Args:
         config: sizes.
         params: of the network.
-        carry: frames (H, W, C * (stack - 1)) uint8, the newest last; zeros start an episode.
+        carry: frames (H, W, C * (stack - 1)) uint8, and all readings of scans and vectors, the newest last; zeros start
+            an episode.
         image: (H, W, C) uint8, or a dict of images and vectors.
 
     Returns:
         The new carry and the action (A,) in [-1, 1].
     """
-    pixels, vector = spaces.image_of(image), spaces.vector_of(image)
+    several = isinstance(image, Mapping)
+    parts = parted(image, rays_of(config, {name: one.shape for name, one in image.items()})) if several else {
+        "frames": image}  # fmt: skip
     seen, after = {}, {}
-    if pixels is not None:
-        seen["frames"] = jnp.concatenate([carry["frames"], pixels], axis=-1)
-        after["frames"] = seen["frames"][..., pixels.shape[-1] :]
-    if vector is not None:
-        seen["vector"] = vector
-    batched = {name: value[None] for name, value in seen.items()}
-    mean, _, _ = forward(config, params, batched if isinstance(image, Mapping) else batched["frames"])
+    for kind, new in parts.items():
+        if kind == "frames":
+            seen[kind] = jnp.concatenate([carry[kind], new], axis=-1)
+            after[kind] = seen[kind][..., new.shape[-1] :]
+        elif config.readings == 1:
+            seen[kind] = new
+        else:
+            seen[kind] = after[kind] = remember(carry[kind][None], new[None], carry["begun"][None] < 0.5)[0]
+            after["begun"] = jnp.ones(())
+    batched = {kind: value[None] for kind, value in seen.items()}
+    mean, _, _ = forward(config, params, batched if several else batched["frames"])
     return after, jnp.clip(mean[0], -1.0, 1.0)
 
 
 def policy_carry(config: PpoConfig, obs_shape: Any) -> dict[str, jax.Array]:
-    """Zero carry of `policy_step` for what an environment shows; of vectors alone nothing is kept."""
+    """Zero carry of `policy_step` for what an environment shows; of single readings nothing is kept."""
     shape = obs_shape if isinstance(obs_shape, Mapping) else {"camera": obs_shape}
-    empty = empty_frames(config, shape, (), config.stack - 1)
-    return {"frames": empty["frames"]} if "frames" in empty else {}
+    kept = empty_frames(config, shape, ())
+    images = {"frames": kept.pop("frames")[..., : -spaces.image_shape(shape)[2]]} if "frames" in kept else {}
+    return {**images, **kept, "begun": jnp.zeros(())} if kept and config.readings > 1 else images

@@ -26,16 +26,17 @@ class AmongPeople(MapGoal):
     name: ClassVar[str] = "among_people"
     budgets: ClassVar[dict[str, Budget]] = {
         "wallclock": Budget(
-            40_000_000, eval_every=2_000_000, second_tries=0.5, stop_success=0.97, fields={"action_repeat": 2}
+            40_000_000, eval_every=2_000_000, second_tries=0.5, stop_success=0.97, fields={"action_repeat": 2},
+            ppo=dict(readings=3, scan=90, discount=0.995, lr=5e-4),
         ),
         "cpu": Budget(1_000_000, eval_every=250_000, instances=32, fields={"action_repeat": 2, "senses": "lidar"},
-                      ppo=dict(rollout=64, minibatches=8)),
+                      ppo=dict(rollout=64, minibatches=8, readings=3, scan=90)),
     }  # fmt: skip
 
     map: str = "made:0,made:1"
     """As of `map_goal`; floor plans of ours unless you give others."""
     people: int = 8
-    collision_reward: float = -100.0
+    collision_reward: float = -200.0
     senses: str = "both"
     """"camera", "lidar" or "both"."""
 

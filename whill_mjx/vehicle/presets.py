@@ -22,11 +22,15 @@ from whill_mjx.effects.pid_drive import ForwardSlip, PidDrive, RollingContact
 from whill_mjx.effects.rolling_resistance import RollingResistance
 from whill_mjx.effects.slip_traction import SlipTraction
 from whill_mjx.effects.state_rate import StateRate
+from whill_mjx.effects.suspension import Suspension
 from whill_mjx.effects.torque_drive import TorqueDrive
 from whill_mjx.effects.yaw_scrub import YawScrub
 from whill_mjx.vehicle.model import box_inertia
-from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
+from whill_mjx.vehicle.specs import GRAVITY, SPECS, VehicleSpec, find_spec
 from whill_mjx.vehicle.types import Body, VehicleParams
+
+SAG = 0.005 / 0.1325  # of a wheel's radius, under the weight at rest: the chair's
+SPARE = 1.5  # torque of a skid drive over that at which its wheels slide sideways (estimate)
 
 
 def preset(name: str) -> tuple[VehicleSpec, VehicleParams]:
@@ -127,6 +131,25 @@ def physical(spec: VehicleSpec) -> VehicleParams:
             with_values(OdometryLag, time_constant=0.03),
         ),
     )
+
+
+def in_short(spec: VehicleSpec, kind: str) -> VehicleParams:
+    """The base model of a vehicle of which only a short file is known.
+
+    The physical one stands on tyres that give way in proportion to their radius: with the chair's 5 mm a robot of 10 cm
+    wheelbase would lean by 2 degrees. The motors of a skid drive can turn its wheels against their friction.
+    """
+    params = preset_params(spec, kind)
+    if kind != "physical":
+        return params
+    found = {effect.name: effect for effect in params.effects}
+    drive, slip = found["torque_drive"], found["slip_traction"]
+    if spec.drive == "skid":
+        sliding = slip.mu * spec.mass / 2 * GRAVITY * spec.wheel_radius  # N m, of one side
+        drive = replace(drive, limit=jnp.maximum(drive.limit, SPARE * sliding))
+    tyres = with_values(Suspension, sag=SAG * spec.wheel_radius, damping=0.5)
+    effects = (*(drive if effect.name == "torque_drive" else effect for effect in params.effects), tyres)
+    return VehicleParams(params.body, effects)
 
 
 def documented(spec: VehicleSpec) -> VehicleParams:

@@ -27,8 +27,8 @@ from whill_mjx.effects import EFFECTS
 from whill_mjx.io import fields
 from whill_mjx.io.formats import upgraded
 from whill_mjx.io.reading import read_toml
-from whill_mjx.vehicle.presets import preset, preset_params
-from whill_mjx.vehicle.specs import CameraMount, VehicleSpec
+from whill_mjx.vehicle.presets import in_short, preset
+from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec, in_proportion
 from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
 
 SCHEMA = 1
@@ -117,7 +117,7 @@ def read_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str
     content = _read(path)
     spec = _read_spec(path, content["spec"])
     if "body" not in content and "effects" not in content:
-        return spec, preset_params(spec, content.get("base", "physical")), content.get("provenance", {})
+        return spec, in_short(spec, content.get("base", "physical")), content.get("provenance", {})
     body = _read_parameters(path, "body", Body, content["body"])
     effects: dict[str, Any] = {}
     for name, table in _effect_tables(path, content):
@@ -190,11 +190,16 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _read_spec(path: Path, table: dict[str, Any]) -> VehicleSpec:
+    """The spec; where the file leaves out sizes of the body, the wheels' inertia or the camera's place, they are in
+    proportion to the chair's."""
     table = dict(table)
     camera = fields.check_table(str(path), fields.CAMERA, table.pop("camera", {}), "spec.camera", NEWER)
     checked = fields.check_table(str(path), fields.SPEC, table, "spec", NEWER)
     try:
-        return VehicleSpec(**checked, camera=CameraMount(**camera))
+        usual = in_proportion(WHILL_CR, checked["name"], checked["wheel_radius"], checked["track"],
+                              checked["wheelbase"], checked["mass"])
+        known = {name: getattr(usual, name) for name in ("wheel_inertia", "body_length", "body_width", "body_height")}
+        return VehicleSpec(**(known | checked), camera=dataclasses.replace(usual.camera, **camera))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 

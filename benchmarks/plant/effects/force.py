@@ -16,6 +16,8 @@ class DryFriction(Effect):
 
     def start(self) -> None:
         self.bristle = [0.0, 0.0]
+        self.damping = 0.3 * self.chair.torque_limit / Chair().torque_limit
+        """Of the bristles [N m s/rad], in proportion to the drives: the chair's would shake a wheel of 60 g cm^2."""
 
     def load(self, moment: Moment, load: Load) -> None:
         stiffness = self.size / 0.015  # N m/rad: full friction after 0.015 rad
@@ -26,7 +28,7 @@ class DryFriction(Effect):
             before = self.bristle[side]
             self.bristle[side] = settled + (before - settled) * math.exp(-rate * TICK)
             creep = (self.bristle[side] - before) / TICK
-            load.wheel[side] -= stiffness * self.bristle[side] + 0.3 * creep
+            load.wheel[side] -= stiffness * self.bristle[side] + self.damping * creep
 
 
 class YawScrub(Effect):

@@ -17,6 +17,7 @@ def in_blocks(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
     XLA joins all that is computed between two loops, and computes it anew wherever it is used: the tables of an image
     in each pixel, a pixel for each of its bytes. What enters a loop or leaves it is computed once. A block is a half of
     a single image, or several whole images under `vmap`. The result has no derivative.
+    `function` gets every array as an argument: one that it closes over is lost under `vmap` of a loop.
     """
     if jax.default_backend() != "cpu":
         return function

@@ -122,12 +122,12 @@ def unpack_colours(word: jax.Array) -> jax.Array:
 def _words(view: View, finite: jax.Array, stage: Arrays, quality: Quality) -> jax.Array:
     """(H, W) uint32 colours of an image."""
 
-    def drawn(rows: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
+    def drawn(rows: jax.Array, columns: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
         word = pack_channels(stage, pixel_colours(view, stage, quality, rows[:, None], columns))
         return jnp.where(finite, word, jnp.uint32(0))
 
     rows, columns = _grid(view.intrinsics)
-    return in_blocks(drawn)(rows[:, 0], view, finite, stage)
+    return in_blocks(drawn)(rows[:, 0], columns, view, finite, stage)
 
 
 def _grid(intrinsics: Intrinsics) -> tuple[jax.Array, jax.Array]:

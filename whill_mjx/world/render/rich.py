@@ -78,7 +78,7 @@ def _paint(stage: Any, surface: Surface, seed: jax.Array) -> tuple[list, jax.Arr
     line = jnp.floor(b)
     a = s * m[9] + m[11] * line + 0.19
     column = jnp.floor(a)
-    lot = random_cell(column, line, own, seed, stage.whole)
+    lot = random_cell(column + 0.5, line + 0.5, own + 0.5, seed, stage.whole)  # halves: rounding down is exact there
     other = lot * 61.0 - jnp.floor(lot * 61.0)
     cells = jnp.maximum(m[9], m[10]) * pixel  # cells in a pixel
     fine = stage.ratio(1.0, 1.0 + 4.0 * cells * cells)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sysid.logs.coverage import sanity
-from sysid.logs.lost_pose import LEAST, lost, without_lost, yaw_contradiction
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.unusable import LEAST, lost, without_lost, yaw_contradiction
 from sysid.search.fitting import make_problem
 from sysid.search.settings import FitConfig
 from whill_mjx.vehicle.specs import WARTHOG

@@ -1,4 +1,4 @@
-"""Driving logs from a simulated vehicle with known parameters, in the dataset format: planted truth for tests."""
+"""Driving logs of a simulated vehicle with known parameters, in the dataset format: planted truth."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import numpy as np
 from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.replay.records import Plant
 from sysid.replay.rollout import make_batch, simulate, vehicle_plant
+from sysid.search.settings import FitConfig
 from whill_mjx.logs.dataset import Noise, SensorNoise, write_fields, write_trial
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES, Scenario, command_table
+from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
 
 MEASUREMENT_DT = 0.05  # s
@@ -35,17 +37,16 @@ class Schedule:
     """Of start poses and noise."""
 
 
+def fitted_plant(spec: VehicleSpec) -> Plant:
+    """The simulator's vehicle with a fit's default physics step, which is part of a model."""
+    return vehicle_plant(spec, VehicleConfig(physics_dt=FitConfig.physics_dt))
+
+
 def write_dataset(
     folder: str | Path, spec: VehicleSpec, params: Any, schedule: Schedule = Schedule(), *,  # noqa: B008
     noise: SensorNoise | None = None, plant: Plant | None = None,
 ) -> Path:
-    """Drive the manoeuvres with a vehicle and write the log.
-
-    Args:
-        folder: dataset folder to create.
-        spec, params: the vehicle; `params` holds the planted truth.
-        plant: by default the simulator's vehicle of `spec`.
-    """
+    """Drive the manoeuvres with the vehicle `spec`, `params` (the planted truth), or `plant`, and write a dataset."""
     folder, noise = Path(folder), noise or SensorNoise()
     random = np.random.default_rng(schedule.seed)
     plant = plant or vehicle_plant(spec)
