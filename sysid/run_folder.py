@@ -76,7 +76,7 @@ def _compiled(file: Path, wheels: Sequence[str]) -> bytes:
 
     from sysid.replay.robot_files import read_robot
 
-    model = read_robot(file, wheels)[0].compile()
+    model = read_robot(file, wheels).spec.compile()
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
