@@ -31,6 +31,7 @@ from whill_mjx.world.maps import (
     read_map,
     shown,
 )
+from whill_mjx.world.maps import walls as map_wall_module
 from whill_mjx.world.maps.several import GAP, side_by_side
 from whill_mjx.world.maps.straight import open_space, outline, straight_walls
 from whill_mjx.world.maps.walls import map_walls, most_seen, wall_boxes
@@ -79,6 +80,23 @@ def test_streaks_and_specks_go_and_pillars_stay():
     space = open_space(GridMap(cells, 0.05, (0.0, 0.0, 0.0)))
     assert not space[20, 50:].any() and space[30:32, 30:32].all()
     assert not space[40:42, 20:22].any() and not space[10:20, 10:20].any()
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("most", [1, 7, 29])
+def test_walls_met_block_by_block_are_those_of_all_at_once(monkeypatch, most):
+    rng = np.random.default_rng(1)
+    ends = jnp.asarray(rng.uniform(-5, 5, (30, 2, 2)), jnp.float32)
+    angles = jnp.linspace(-3.0, 3.0, 41)
+    place = jnp.asarray(rng.uniform(-1, 1, (2, 41, 1)), jnp.float32)  # each ray begins at its own
+    distance, index = cast(ends, *place, angles)
+    monkeypatch.setattr(map_wall_module, "MOST", most)
+    blocks, which = cast(ends, *place, angles)
+    np.testing.assert_allclose(blocks, distance, rtol=1e-4)
+    met = np.isfinite(distance)
+    assert 20 < met.sum() and len(set(index[met].tolist())) > 5
+    np.testing.assert_array_equal(which[met], index[met])
+
 
 
 def test_a_ray_meets_the_first_wall_and_none_slips_through_a_corner():
