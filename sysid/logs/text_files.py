@@ -28,7 +28,8 @@ from sysid.logs.columns import (
     with_unit,
 )  # fmt: skip
 from sysid.logs.directions import RESPONSE, VARIED
-from sysid.logs.wheel_states import DIFFERENCED, integrate_speeds, pose_speeds
+from sysid.logs.transforms import DIFFERENCED, pose_speeds
+from sysid.logs.wheel_states import integrate_speeds
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
 

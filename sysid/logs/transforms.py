@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.wheel_states import DIFFERENCED, pose_speeds
 from whill_mjx.io.fields import shown
 
 KINDS = ("TFMessage", "tfMessage")
@@ -21,6 +20,7 @@ BASES = ("base_footprint", "base_link", "base", "base_frame", "chassis", "robot"
 """Names of the frame that moves with the vehicle, the first found is taken."""
 FIXED = ("map", "world", "earth", "mocap", "vicon", "optitrack", "qualisys", "global", "utm")
 """Names of frames that stand still outside of the vehicle."""
+DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 STANDING = 1e-6  # m, and of a quaternion, that a link may change by and not count as moving
 LISTED = 12  # links that an error names
 
@@ -208,6 +208,14 @@ def chosen_poses(links: Links, asked: dict[str, str], wanted: Iterable[str], not
         more = f"; v and omega are its differences over {DIFFERENCED:g} s" if stream == "odometry" else ""
         notes.append(f"{stream} is {shown(one.child)} in {shown(one.parent)}, of the transforms{more}")
     return found
+
+
+def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Forward speed and yaw rate (T,) of a pose (T,) whose yaw does not wrap, over `DIFFERENCED` seconds."""
+    half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
+    low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
+    dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
+    return (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
 
 
 def _last(frame: str) -> str:

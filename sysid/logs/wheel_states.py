@@ -24,7 +24,6 @@ int32 error
 """
 JOYSTICK_FIELDS = "int8 joy_front\nint8 joy_side\n"  # that newer drivers add
 KMH = 1 / 3.6  # m/s
-DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 COARSE = 0.15  # s between states, above which speeds are too coarse to identify a drive from
 
 
@@ -82,14 +81,6 @@ def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[n
     step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
     return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
             np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)
-
-
-def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Forward speed and yaw rate (T,) of a pose (T,) whose yaw does not wrap, over `DIFFERENCED` seconds."""
-    half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
-    low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
-    dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
-    return (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
 
 
 def _odometry(t: np.ndarray, angles: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
