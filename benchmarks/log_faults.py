@@ -340,6 +340,22 @@ def _commands_cut(drives: list[Drive], size: float, random: Random) -> list[Driv
     return made
 
 
+def _recorder_paused(drives: list[Drive], size: float, random: Random) -> list[Drive]:
+    """Drives of which a part of all streams was not recorded; commands come at a rate, so that they are missed."""
+    made = []
+    for drive in drives:
+        drive = {**drive, "command": _sampled("command", drive["command"], 20.0, random)}
+        at = _moving_at(drive, random)
+        made.append({name: table[(table[:, 0] < at) | (table[:, 0] > at + size)] for name, table in drive.items()})
+    return made
+
+
+def _z_down(drives: list[Drive], size: float, random: Random) -> list[Drive]:
+    """The outside pose in a frame whose z points down, of the first part of the turn only where small."""
+    return [{**drive, "ground_truth": drive["ground_truth"] * [1, 1, -1, -1]}
+            for drive in (_cut_at_turn(drive, size) for drive in drives)]
+
+
 def _sizes(drives: list[Drive], size: float, random: Random) -> list[Drive]:
     """Nominal sizes by which the odometry goes and turns too far, or not far enough."""
     scale = 1 + size * random.choice([-1.0, 1.0])
@@ -382,5 +398,7 @@ FAULTS: Sequence[Fault] = (
     Fault("clock fast", (0.12, 0.06, 0.001), "share", _clock_fast, "its clock runs", 1.0),
     Fault("commands late", (5.0, 2.5, 0.1), "s", _commands_late, "another clock", 1.0),
     Fault("nominal sizes wrong", (0.2, 0.09, 0.01), "share", _sizes, "as far as the odometry says", 1.0),
+    Fault("recorder paused", (3.0, 1.5, 0.1), "s", _recorder_paused, "the recording paused"),
+    Fault("z down", (6.0, 2.0, 0.02), "rad", _z_down, "points down|left-handed", 2.0),
     Fault("commands cut", (0.7, 0.5, 0.0), "share", _commands_cut, "commands end", 1.0),
 )

@@ -26,6 +26,9 @@ def merge(source: Path, results: Path = RESULTS, only: Collection[str] = ()) -> 
     content = read_json(source, "no such file. Give a result file.", "Give a result file of a benchmark.")
     if not isinstance(content.get("figures"), dict):
         raise ValueError(f"{source}: has no figures. Give a result file of a benchmark.")
+    for name, entry in content["figures"].items():
+        if not isinstance(entry, dict) or "value" not in entry:
+            raise ValueError(f"{source}: figure {name!r} has no value. Give a result file as a benchmark wrote it.")
     if missing := sorted(set(only) - set(content["figures"])):
         raise ValueError(f"{source} has no figure {', '.join(missing)}; it has {', '.join(content['figures'])}.")
     if only:

@@ -43,6 +43,7 @@ from benchmarks.harness import RESULTS, device_name, figure, provenance, record
 from bridge.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.folders import write_whole
+from whill_mjx.io.reading import read_json
 
 CLAIM = "No file, mistake, kill or full disk ends in a traceback, lost work or half-written results"
 ROOT = Path(__file__).parents[1]
@@ -97,7 +98,7 @@ class Kept:
     def read(self, name: str, any_commit: bool = False) -> dict[str, Any]:
         """What is known; empty where nothing is, or it is of another commit."""
         path = self.folder / f"{name}.json"
-        found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+        found = read_json(path, "missing.", "Remove it, and measure again.") if path.exists() else {}
         return found if any_commit or found.get("commit") == self._commit else {}
 
     def all(self, beginning: str) -> list[dict[str, Any]]:

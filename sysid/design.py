@@ -28,7 +28,7 @@ from sysid.intervals.design import Criterion, Subject, propose
 from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
-from whill_mjx.io.folders import check_place
+from whill_mjx.io.folders import check_file, note_written
 from whill_mjx.vehicle.parameters import describe
 
 
@@ -84,26 +84,29 @@ def main(config: DesignConfig) -> list[Path]:
         found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
                         names=config.parameters or None)
     paths = []
-    for number, plan in enumerate(found.chosen, start=1):
-        path = config.out if number == 1 else config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
-        command = plan.candidate.command
-        write_csv(path, COMMAND_HEADER, command.table)
+    for path, plan in zip(command_files(config), found.chosen, strict=False):
+        write_csv(path, COMMAND_HEADER, plan.candidate.command.table)
         paths.append(path)
     print(text(found, config.criterion))
     paths.append(write_page(config.out.with_suffix(".html"), found, limits, config, describe(subject.params)))
+    note_written(*paths)
     for path in paths:
         print(f"wrote {path}")
     return paths
+
+
+def command_files(config: DesignConfig) -> list[Path]:
+    """Where each manoeuvre is written: NAME.csv, NAME_2.csv, ..."""
+    return [config.out, *(config.out.with_name(f"{config.out.stem}_{number}{config.out.suffix}")
+                          for number in range(2, config.count + 1))]
 
 
 def check_out(config: DesignConfig) -> None:
     """Raise OptionError where the command files or the page cannot be written."""
     if config.out.suffix != ".csv":
         raise OptionError(f"--out {config.out}: must end in .csv. Correct the name.")
-    for path in (config.out, config.out.with_suffix(".html")):
-        if path.is_dir():
-            raise OptionError(f"--out {config.out}: {path} is a folder. Choose another name.")
-    check_place("--out", config.out)
+    for path in (*command_files(config), config.out.with_suffix(".html")):
+        check_file("--out", path)
 
 
 def load_subject(name: str) -> Subject:

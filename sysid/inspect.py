@@ -27,7 +27,7 @@ from sysid.logs.inspection import inspect, load_whole, text
 from sysid.logs.next_drives import NextDrive, next_drives
 from sysid.logs.records import Log
 from whill_mjx.io.command_line import POSITIVE, Range
-from whill_mjx.io.folders import claim_folder
+from whill_mjx.io.folders import check_file, claim_folder, note_written
 from whill_mjx.io.formats import stamp
 
 KIND = "sysid.inspect"
@@ -69,6 +69,8 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
     from sysid.replay.robot_check import check_robot, describe_robot
     from sysid.replay.robot_loading import load_robot
 
+    picture = (config.out or Path()) / f"{config.dataset.name.partition('.')[0]}.png"
+    check_file("--out" if config.out else "picture", picture)
     robot = load_robot(config.dataset, config.wheels)
     check = check_robot(robot)
     found = {"wheel_radius": robot.wheel_radius, "track": robot.distance, "driven_wheels": len(robot.wheels),
@@ -77,8 +79,8 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
     print(json.dumps(plain(found), indent=1) if config.json else "\n".join(describe_robot(robot, check)))
     if config.out is not None:
         config.out.mkdir(parents=True, exist_ok=True)
-    picture = (config.out or Path()) / f"{config.dataset.name.partition('.')[0]}.png"
     write_robot(picture, robot, check.loads)
+    note_written(picture)
     print(f"wrote {picture}", file=sys.stderr)
     return found
 

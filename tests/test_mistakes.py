@@ -64,6 +64,8 @@ def mistakes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mistakes")
     shutil.copytree(CHAIR, folder / "data")
     (folder / "file").write_text("")
+    for name in ("mine.csv", "other_2.csv", "robot.png", "robot.urdf"):
+        (folder / name).write_text("mine")
     (folder / "folder.csv").mkdir()
     (folder / "mine").mkdir()
     (folder / "mine" / "vehicle.toml").write_text("mine")
@@ -95,6 +97,9 @@ def mistakes(tmp_path_factory):
     ("fit", "data --trials 10", "--trials: has an effect only with --method tpe or cmaes or both"),
     ("fit", "data --study a", "--study: has an effect only with --storage"),
     ("close_loop", "data --reference-train a", "--reference-train: has an effect only with --reference"),
+    ("design", "whill_cr --out mine.csv", "--out mine.csv: exists already, and is not as a command of this project"),
+    ("design", "whill_cr --out other.csv --count 2", "--out other_2.csv: exists already"),
+    ("inspect", "robot.urdf", "robot.png: exists already"),
     ("design", "whill_cr --out data/trials/circle_1/command.csv", "lies among the trials of"),
     ("convert", "data --out new --fps 10", "--fps: has an effect only with --to lerobot"),
     ("convert", "data --out new --pause 3", "--pause: has an effect only with --split standstill"),
@@ -175,7 +180,7 @@ def mistakes(tmp_path_factory):
     ("design", "whill_cr --criterion e", "--criterion"),
     ("design", "whill_cr --parameters nope", "nope"),
     ("design", "whill_cr --out empty", "--out empty: must end in .csv"),
-    ("design", "whill_cr --out folder.csv", "--out folder.csv: folder.csv is a folder"),
+    ("design", "whill_cr --out folder.csv", "--out folder.csv: is a folder"),
     ("design", "whill_cr --out file/a.csv", "file is a file, not a folder"),
     ("design", "nope", "unknown vehicle 'nope'"),
     ("design", "empty", "empty"),

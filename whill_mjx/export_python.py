@@ -37,7 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx import __version__
-from whill_mjx.io.folders import check_place, write_whole
+from whill_mjx.io.folders import check_file, note_written, write_whole
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import place, substep
 from whill_mjx.vehicle.kinematics import reference_pose
@@ -369,11 +369,12 @@ def main(options: Options) -> None:
 
     with refusing():
         spec, params, _ = load_vehicle(options.vehicle)
-        if options.out.suffix != ".py" or options.out.is_dir():
+        if options.out.suffix != ".py":
             raise OptionError(f"--out {options.out}: must be a file that ends in .py. Correct the name.")
-        check_place("--out", options.out)
+        check_file("--out", options.out)
         source = vehicle_source(spec, params, options.physics_dt)
     write_whole(options.out, source)
+    note_written(options.out)
     print(f"wrote {options.out}: {source.count(chr(10))} lines, effects {', '.join(e.name for e in params.effects)}")
     if options.check:
         table = command_table("figure_eight", Scenario())

@@ -32,7 +32,7 @@ from tqdm import tqdm
 from whill_mjx.env import Env, State, make_env, observe, reset_state, step_state
 from whill_mjx.evaluation.planner import PlannerConfig, first_plan, for_task, plan_action
 from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun, step_with_terms
-from whill_mjx.io.folders import check_place, whole_file, write_whole
+from whill_mjx.io.folders import check_file, note_written, whole_file, write_whole
 from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.options import named_task, read_fields
@@ -289,17 +289,31 @@ def main(options: Look) -> None:
     if options.scene in ("gallery", "all") and (options.live or options.set or options.out.suffix == RECORDING):
         raise OptionError(f"--scene {options.scene}: is no single task, as --set, --live and {RECORDING} need. Name "
                           "one task.")
-    if options.out.is_dir():
-        raise OptionError(f"--out {options.out}: is a folder. Give the name of a file.")
-    check_place("--out", options.out)
-    if options.scene == "all":
-        for name in known:
-            if name in TASKS and (missing := _missing(TASKS[name])):
-                print(f"{name}: left out. {missing}")
-                continue
-            out = options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
-            main(dataclasses.replace(options, scene=name, out=out))
+    if options.scene != "all":
+        _show(options)
         return
+    missing = {name: said for name in known if name in TASKS and (said := _missing(TASKS[name]))}
+    outs = {name: options.out.with_name(f"{options.out.stem}_{name}{options.out.suffix}")
+            for name in known if name not in missing}
+    for out in outs.values():
+        check_file("--out", out)
+    for name, said in missing.items():
+        print(f"{name}: left out. {said}")
+    for name, out in outs.items():
+        _show(dataclasses.replace(options, scene=name, out=out))
+
+
+def _show(options: Look) -> None:
+    """Draw or drive one scene."""
+    viewed = options.live and options.out.suffix != RECORDING  # nothing is written
+    if not viewed:
+        check_file("--out", options.out)
+    _draw(options)
+    if not viewed:
+        note_written(options.out)
+
+
+def _draw(options: Look) -> None:
     if options.live or options.out.suffix == RECORDING:
         try:
             load_rerun()

@@ -14,7 +14,7 @@ if starts(__name__):
 
 import numpy as np
 
-from whill_mjx.io.folders import check_place, write_whole
+from whill_mjx.io.folders import check_file, note_written, write_whole
 from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments
 from whill_mjx.world.maps.picture import from_above
 
@@ -41,8 +41,9 @@ class Import:
 def main(options: Import) -> None:
     """Write picture and scene, and print what was found."""
     picture, arrays = (Path(f"{options.out}{ending}") for ending in (".png", ".npz"))
-    check_place("--out", picture)
     with refusing():
+        for path in (picture, arrays):
+            check_file("--out", path)
         grid = read_map(options.file, options.cell, options.scale)
         try:
             made = make_map_scene(grid, Reach(passing=options.width / 2))
@@ -60,6 +61,7 @@ def main(options: Import) -> None:
     np.savez_compressed(buffer, walls=made.walls.segments, start=places.start, goal=places.goal, way=places.way)
     write_whole(arrays, buffer.getvalue())
     write_whole(picture, from_above(made, options.pixels))
+    note_written(picture, arrays)
     print(f"{picture}, {arrays}")
 
 

@@ -26,7 +26,7 @@ import jax
 from dreamer import checkpoint, parallel
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.env import make_env
-from whill_mjx.io.folders import Claim, claim_folder, write_whole
+from whill_mjx.io.folders import RUN_FILE, Claim, FolderRefused, claim_folder, write_whole
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
 from whill_mjx.learning.index_page import list_results, write_index
 from whill_mjx.learning.memory import check_memory
@@ -165,6 +165,9 @@ def prepare_vehicle(
         FolderRefused: RUN holds a training that differs in anything that changes its result.
     """
     target, known = options.out / "vehicle.toml", claim.identity
+    if absent := sorted({"vehicle", "data"} - set({"vehicle": "", "data": ""} if known is None else known)):
+        raise FolderRefused(f"--out {options.out}: {options.out / RUN_FILE} does not say which run this is: it has no "
+                            f"{absent[0]}. Choose another --out.")
     here = load_vehicle(target) if target.exists() else None
     begun = bool(checkpoint.complete(options.out / "checkpoints")) or _has_lines(options.out / "metrics.jsonl")
     vehicle, data, fitted = given or here, known["data"] if known else None, None

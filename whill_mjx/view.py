@@ -21,7 +21,7 @@ import tyro
 
 from whill_mjx.browser.page import relative_links, runs_page
 from whill_mjx.browser.read import find_runs, read_runs
-from whill_mjx.io.folders import check_place, write_whole
+from whill_mjx.io.folders import check_file, note_written, write_whole
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,16 @@ def main(options: ViewOptions) -> Path | None:
             raise ValueError("RUN: none is given. Name the folder that a command wrote by --out.")
         folders = find_runs(options.runs)
         if not options.serve:
-            if options.out.is_dir() or options.out.suffix != ".html":
+            if options.out.suffix != ".html":
                 raise OptionError(f"--out {options.out}: must be a file that ends in .html. Correct the name.")
-            check_place("--out", options.out)
+            check_file("--out", options.out)
     embed = round(1e6 * options.embed_mb)
     if options.serve:
         serve(options, embed)
         return None
     runs = read_runs(folders)
     write_whole(options.out, runs_page(runs, relative_links(options.out), embed))
+    note_written(options.out)
     for one in runs:
         print(f"{one.name}: {one.kind}, {one.state}. {one.sentence}")
     print(f"wrote {options.out}: open it in a browser")

@@ -95,9 +95,14 @@ class Column:
     sure: bool = True
     assumed: bool = False  # whether neither name nor numbers show the unit, so that it is the usual one
     moves: bool = True  # whether its numbers change by what a moving vehicle would have in this unit
+    sign: float = 1.0  # -1 where it counts the other way round
 
     def __str__(self) -> str:
-        return f"{self.role}={self.file}/{self.name}:{self.unit}"
+        return f"{self.role}={self.file}/{self.name}:{'-' if self.sign < 0 else ''}{self.unit}"
+
+    def in_si(self, values: np.ndarray) -> np.ndarray:
+        """Its numbers (T,) in SI units."""
+        return np.asarray(values * (self.sign * size_of(self.role, self.unit)))
 
 
 @dataclass(frozen=True)
@@ -130,7 +135,10 @@ def size_of(role: str, unit: str) -> float:
 
 
 def read_decision(text: str, tables: Sequence[Table]) -> Column:
-    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it; ValueError where it is none."""
+    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it; a minus before the unit, or in its place, turns the sign.
+
+    ValueError where it is none.
+    """
     role, equals, rest = text.partition("=")
     role, rest = role.strip(), rest.strip()
     if not equals or role not in ROLES:
@@ -141,13 +149,15 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
                 unit = rest[len(written) :].strip()
                 if rest.startswith(written) and (not unit or unit.startswith(":")):
                     unit = _unit(unit[1:].strip()) if unit else ""
+                    sign = -1.0 if unit.startswith("-") and role != "time" and kind_of(role) != "none" else 1.0
+                    unit = _unit(unit[1:]) if sign < 0 else unit
                     if unit and not _is_known(role, unit):
                         known = ", ".join(UNITS["speed"] | UNITS["rate"] if role.endswith(("left", "right")) else
                                           UNITS[kind_of(role)])
                         ticks = {"time": ", Nhz for N rows in a second"}.get(
                             role, ", N/rev for N ticks in a turn" if role.endswith("_angle") else "")
                         raise ValueError(f"--columns {text}: {unit!r} is no unit of {role} (known: {known}{ticks}).")
-                    return Column(role, table.stem, name, unit or _split_unit(name)[1], "" if unit else SAID)
+                    return Column(role, table.stem, name, unit or _split_unit(name)[1], "" if unit else SAID, sign=sign)
     known = ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns)
     raise ValueError(f"--columns {text}: no such column (found {known[:400]}). Correct its name.")
 
@@ -417,7 +427,7 @@ class _Known:
         if one is None or clock is None or (unit or one.unit) not in UNITS[kind_of(role)]:
             return None
         t = self.arrays[clock.file, clock.name] * size_of("time", clock.unit)
-        values = self.arrays[one.file, one.name] * UNITS[kind_of(role)][unit or one.unit]
+        values = self.arrays[one.file, one.name] * (one.sign * UNITS[kind_of(role)][unit or one.unit])
         good = np.isfinite(t) & np.isfinite(values)
         return (t[good], values[good]) if good.sum() > 20 else None
 

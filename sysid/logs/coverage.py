@@ -13,7 +13,7 @@ from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replica
 from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
-from sysid.logs.time_faults import pauses, time_faults, uncommanded
+from sysid.logs.time_faults import pauses, set_forward, time_faults, uncommanded
 from sysid.logs.unusable import LOST, lost, said, stood
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
@@ -131,11 +131,13 @@ def doubts(log: Log) -> list[str]:
 def faults(log: Log, responses: Responses | None = None) -> list[str]:
     """Of what `sanity` says, units, signs, frames and times that are wrong."""
     trials, skid = log.trials, log.spec.drive == "skid"
+    if jumped := set_forward(trials):
+        return jumped
     found: list[str] = []
     cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
-        found += contradicted[channel]
+        found += [one for one in contradicted[channel] if one not in found]
         seen, reversed_ones, clear = list[str](), list[str](), True
         shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
@@ -155,6 +157,10 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
             elif gain < 0 and channel == "ground_truth" and name == "v":
                 reversed_ones.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add "
                                      "pi to yaw, or negate the commands' v, whichever is wrong.")
+            elif gain < 0 and channel == "ground_truth":
+                reversed_ones.append(f"{where}: it turns against the commands, and x and y with it. Either z of its "
+                                     "frame points down (NED): negate y and yaw; or the commands' omega has the wrong "
+                                     "sign.")
             elif gain < 0:
                 reversed_ones.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise "
                                      "positive omega and yaw; negate it.")

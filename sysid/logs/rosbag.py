@@ -2,7 +2,8 @@
 
 Known are the paper's topics, the maker's, and those of `bridge.ros`; others are named by the caller or found by their
 type where only one topic has it. Messages: Twist and TwistStamped as commands, Odometry as odometry, Odometry,
-PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and the yaw rate of an Imu.
+PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and the yaw rate of an Imu. Where there is
+no pose, the transforms between frames (TFMessage) are chained to one.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs import transforms
 from sysid.logs.bag_clocks import find_bursts, find_step
 from sysid.logs.wheel_states import (
     CHAIR_DEFINITION,
@@ -49,8 +51,7 @@ COLUMNS = {"command": ("v", "omega"), "odometry": ("x", "y", "yaw", "v", "omega"
            "imu": ("gyro",)}
 WHAT = {"command": "commands that reached the vehicle", "odometry": "vehicle's odometry"}
 SIDEWAYS = 0.01  # m/s of a command that is none
-NOT_READ = {"TFMessage": "which is not read: record the pose of the vehicle as Odometry or PoseStamped",
-            "AckermannDriveStamped": "which steers as cars do, and is not read",
+NOT_READ = {"AckermannDriveStamped": "which steers as cars do, and is not read",
             "AckermannDrive": "which steers as cars do, and is not read",
             "Path": "which is not read: record its poses as PoseStamped"}
 """Types that hold a motion, and why none is taken from them."""
@@ -133,9 +134,13 @@ def read_bag(
         store.register(get_types_from_msg(CHAIR_DEFINITION + JOYSTICK_FIELDS, f"whill_msgs/msg/{CHAIR_STATE}"))
         with _opened(AnyReader, path, store, notes) as reader:
             known = {name: str(about.msgtype) for name, about in reader.topics.items() if about.msgcount}
-            chosen = choose_topics(path, known, topics or {}, notes, wheels)
+            framed = _framed(known, topics or {})
+            chosen = choose_topics(path, known, {**(topics or {}), **dict.fromkeys(framed, "")}, notes, wheels)
             rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
-            notes += [] if "ground_truth" in chosen else _not_read(known)
+            streams = _of_frames(path, reader, known, framed, _unposed(chosen, topics or {}, wheels), notes)
+            if not {"odometry", "ground_truth"} & {*chosen, *streams}:
+                raise _no_pose(path, known)
+            notes += [] if "ground_truth" in {*chosen, *streams} else _not_read(known, "odometry" in chosen)
     except Exception as error:  # the library lets out whatever a damaged recording leads to
         if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
             raise
@@ -143,7 +148,6 @@ def read_bag(
                          "metadata.yaml, or a .db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` or "
                          "`mcap recover` repairs one.") from None
     spare = {"imu"} if (topics or {}).get("imu") is None else set()  # found by itself, and nothing depends on it
-    streams = {}
     for stream, topic in chosen.items():
         kept = _usable(path, stream, topic, short_type(known[topic]), rows[stream], notes)
         if len(kept) >= 2:
@@ -177,10 +181,68 @@ def _opened(reader: Any, path: Path, store: Any, notes: list[str]) -> Iterator[A
         opened.close()
 
 
-def _not_read(known: Mapping[str, str]) -> list[str]:
-    """Notes on topics that hold a motion which is not read."""
+def _framed(known: Mapping[str, str], asked: Mapping[str, str]) -> dict[str, str]:
+    """Stream -> "" or "PARENT:CHILD" of those for which transforms were named, as /tf or /tf:PARENT:CHILD."""
+    return {stream: topic.partition(":")[2] for stream, topic in asked.items() if stream in ("odometry", "ground_truth")
+            and short_type(known.get(topic.partition(":")[0], "")) in transforms.KINDS}
+
+
+def _unposed(chosen: Mapping[str, str], asked: Mapping[str, str], wheels: bool) -> list[str]:
+    """The streams of which transforms may be one, where no topic has a pose."""
+    if {"odometry", "ground_truth"} & set(chosen):
+        return []
+    return [stream for stream in ("odometry", "ground_truth")
+            if asked.get(stream) != "" and not (wheels and stream == "odometry")]
+
+
+def _of_frames(
+    path: Path, reader: Any, known: Mapping[str, str], framed: dict[str, str], wanted: list[str], notes: list[str]
+) -> dict[str, BagStream]:
+    """Streams out of transforms: those that were named, or the one that there is of those that are wanted."""
+    topics = [topic for topic, kind in known.items() if short_type(kind) in transforms.KINDS]
+    if not topics or not framed and not wanted:
+        return {}
+    links, broken = transforms.Links(), 0
+    for connection, received, raw in reader.messages(connections=[one for one in reader.connections
+                                                                  if one.topic in topics]):
+        try:
+            links.add(received * 1e-9, reader.deserialize(raw, connection.msgtype))
+        except Exception:  # as of any damaged message
+            broken += 1
+    if broken:
+        notes.append(f"{', '.join(topics)}: {broken} damaged messages are left out")
+    try:
+        found = transforms.chosen_poses(links, framed, wanted, notes)
+    except transforms.NoChain as error:
+        option = OPTIONS[next(iter(framed), wanted[0] if wanted else "ground_truth")]
+        raise ValueError(f"{path}: {', '.join(topics)}: {error}. Name the frames, {option} {topics[0]}:PARENT:CHILD; "
+                         "or record the pose as Odometry or PoseStamped.") from None
+    return {stream: BagStream(f"{topics[0]}:{one.parent}:{one.child}", known[topics[0]], one.received, one.stamped,
+                              one.with_speeds() if stream == "odometry" else one.pose)
+            for stream, one in found.items()}
+
+
+def _no_pose(path: Path, known: dict[str, str]) -> ValueError:
+    more = "".join(f" {one}." for one in _not_read(known))
+    return ValueError(f"{path}: neither odometry nor outside pose found (topics with messages: {_listing(known)})."
+                      f"{more} Name one with --odometry-topic or --truth-topic.")
+
+
+def _listing(known: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} ({short_type(kind)})" for name, kind in sorted(known.items())) or "none"
+
+
+def _not_read(known: Mapping[str, str], frames: bool = False) -> list[str]:
+    """Notes on topics that hold a motion which is not read.
+
+    Args:
+        frames: transforms are none of the streams, though they might be the outside pose.
+    """
     kinds = {short_type(kind): topic for topic, kind in known.items()}
-    return [f"{kinds[kind]} is {kind}, {why}" for kind, why in NOT_READ.items() if kind in kinds]
+    held = [topic for kind, topic in kinds.items() if frames and kind in transforms.KINDS]
+    return [*(f"{kinds[kind]} is {kind}, {why}" for kind, why in NOT_READ.items() if kind in kinds),
+            *(f"{topic} holds frames, which are not looked at: --truth-topic {topic} takes the pose in map or world "
+              "from them, if it measures the vehicle from outside" for topic in held[:1])]
 
 
 def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, list[tuple[float, ...]]]:
@@ -282,7 +344,7 @@ def choose_topics(
     Args:
         wheels: the input is measured wheel speeds.
     """
-    listing = ", ".join(f"{name} ({short_type(kind)})" for name, kind in sorted(known.items())) or "none"
+    listing = _listing(known)
     chosen: dict[str, str] = {}
     types = {**TYPES, "command": WHEELS} if wheels else TYPES
     for stream in TOPICS:
@@ -329,10 +391,6 @@ def choose_topics(
                          "speeds in its place, with an outside pose: --input wheels.")
     if "command" not in chosen:
         raise ValueError(f"{path}: --command-topic is empty; a trial needs its commands. Name their topic.")
-    if not {"odometry", "ground_truth"} & set(chosen):
-        more = "".join(f" {one}." for one in _not_read(known))
-        raise ValueError(f"{path}: neither odometry nor outside pose found (topics with messages: {listing}).{more} "
-                         "Name one with --odometry-topic or --truth-topic.")
     return chosen
 
 

@@ -7,7 +7,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,10 +24,11 @@ from sysid.logs.columns import (
     guess,
     read_decision,
     shown_units,
-    size_of,
     unit_named,
     with_unit,
 )  # fmt: skip
+from sysid.logs.directions import RESPONSE, VARIED
+from sysid.logs.transforms import DIFFERENCED, pose_speeds
 from sysid.logs.wheel_states import integrate_speeds
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import CSV_BYTES, read_text
@@ -35,7 +36,7 @@ from whill_mjx.io.reading import CSV_BYTES, read_text
 SUFFIXES = (".csv", ".txt", ".tsv", ".tum")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 LEAST = 10  # rows of a stream
-DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
+FOLLOWED, UNFOLLOWED = 0.7, 0.5  # correlation with a command of what follows it, and of what does not
 LONGEST_NAME = 200  # characters
 HOUR = 3600.0  # s
 DAY = 86400.0  # s
@@ -107,7 +108,10 @@ def read_drives(
             groups.append((files[0].absolute().parent.name, tables))
     if not groups and refused:
         raise refused[0]
-    drives, notes = join_drives(source, groups, said, geometry, wheels)
+    try:
+        drives, notes = join_drives(source, groups, said, geometry, wheels)
+    except ValueError as error:
+        raise ValueError(f"{error} Left out before: {refused[0]}") if refused else error from None
     return drives, [*(f"left out: {error}" for error in refused), *notes]
 
 
@@ -350,7 +354,7 @@ def _decide(
         print("Columns:", ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns))
         answer = input("Enter takes this; or type what differs, as ROLE=COLUMN:UNIT ROLE=COLUMN:UNIT ...\n> ")
         decided += [read_decision(text, tables) for text in answer.split()]
-        columns = [Column(one.role, one.file, one.name, one.unit, "") for one in guessed_now()]
+        columns = [replace(one, why="", sure=True, assumed=False) for one in guessed_now()]
         problem, said = _problem(tables, columns), [str(one) for one in columns]
     if problem:
         names = [f"{table.stem}/{name}" for table in tables for name in (*table.columns, *table.texts)]
@@ -440,6 +444,11 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     if "command" in streams:
         made["command"] = _as_twist(streams["command"], columns, "command", geometry)
     wheels = _as_twist(_with_rates(streams["wheels"]), columns, "wheels", geometry) if "wheels" in streams else None
+    if wheels is not None and "command" in made and (backwards := _backwards(made["command"], wheels)):
+        one = next(one for one in columns if one.role.startswith(f"wheels.{backwards}"))
+        raise ValueError(f"{source}: {one.file}/{one.name}: the {backwards} wheel counts backwards: the two differ "
+                         f"where the vehicle is sent straight ahead. Turn its sign: --columns {one.role}={one.file}/"
+                         f"{one.name}:-")
     odometry = streams.get("odometry")
     if odometry is not None:
         made["odometry"], note = _as_odometry(odometry, wheels)
@@ -488,9 +497,9 @@ def _stream(
     mine = [one for one in mine if one.file == file]
     table = next(one for one in tables if one.stem == file)
     clock = next(one for one in columns if one.role == "time" and one.file == file)
-    found = {"t": table.columns[clock.name] * size_of("time", clock.unit)}
+    found = {"t": clock.in_si(table.columns[clock.name])}
     for one in mine:
-        found[one.role.partition(".")[2]] = table.columns[one.name] * size_of(one.role, one.unit)
+        found[one.role.partition(".")[2]] = one.in_si(table.columns[one.name])
     whole = np.isfinite(list(found.values())).all(axis=0)
     found = {key: values[whole] for key, values in found.items()}
     notes = _check_clock(file, found["t"])
@@ -513,6 +522,9 @@ def _stream(
         from sysid.logs.rosbag import yaw_of
 
         level = np.zeros(len(found["t"]))  # of a vehicle on a floor qx and qy are often left out
+        if "qx" in found and np.mean(found["qx"] ** 2 + found.get("qy", level) ** 2) > ONE_SIDE:
+            notes.append(f"{file}: by its quaternion the vehicle lies on its side in {stream}: its columns may be in "
+                         "the order w, x, y, z. Say which is which with --columns")
         found["yaw"] = np.array([yaw_of(*one) for one in zip(
             found["qw"], found.get("qx", level), found.get("qy", level), found["qz"], strict=True)])
     if "yaw" in found:
@@ -565,10 +577,22 @@ def _as_twist(rates: dict[str, np.ndarray], columns: Sequence[Column], stream: s
     """(T, 3) of t, v and omega of a command, or of the speeds of two wheels."""
     if "left" not in rates:
         return np.column_stack([rates["t"], rates["v"], rates.get("omega", 0 * rates["t"])])
-    unit = next((one.unit for one in columns if one.role == f"{stream}.left"), "rad/s")
-    size = 1.0 if unit in UNITS["speed"] else geometry[0]
-    left, right = size * rates["left"], size * rates["right"]
+    of_rims = {one.role for one in columns if one.unit in UNITS["speed"]}
+    left, right = (rates[side] * (1.0 if f"{stream}.{side}" in of_rims else geometry[0]) for side in ("left", "right"))
     return np.column_stack([rates["t"], (left + right) / 2, (right - left) / geometry[1]])
+
+
+def _backwards(command: np.ndarray, wheels: np.ndarray) -> str:
+    """The wheel, "left" or "right", whose difference from the other one follows the commanded speed as their mean
+    should; empty where it is not so. Rows (T, 3) of t, v and omega."""
+    held = np.searchsorted(command[:, 0], wheels[:, 0] - RESPONSE, side="right") - 1
+    sent = np.where(held >= 0, command[np.maximum(held, 0), 1], 0.0)
+    if sent.std() < VARIED or min(wheels[:, 1].std(), wheels[:, 2].std()) == 0.0:  # their unit may be another
+        return ""
+    mean, difference = (float(np.corrcoef(sent, wheels[:, k])[0, 1]) for k in (1, 2))
+    if abs(difference) < FOLLOWED or abs(mean) > UNFOLLOWED:
+        return ""
+    return "left" if difference > 0 else "right"
 
 
 def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> tuple[np.ndarray, str]:
@@ -587,10 +611,7 @@ def _as_odometry(odometry: dict[str, np.ndarray], wheels: np.ndarray | None) -> 
     elif wheels is not None:
         v, omega = (np.interp(t, wheels[:, 0], wheels[:, k]) for k in (1, 2))
     else:
-        half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
-        low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
-        dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
-        v, omega = (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
+        v, omega = pose_speeds(t, x, y, yaw)
         note = f"the odometry has poses only: v and omega are their differences over {DIFFERENCED:g} s"
     return np.column_stack([t, x, y, yaw, v, omega]), note
 

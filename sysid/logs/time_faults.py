@@ -12,6 +12,7 @@ from sysid.logs.records import OdometryStream, Trial
 BURST = 0.2  # of the mean interval, below which the median interval shows bursts
 PAUSE = (0.5, 5.0)  # s and mean intervals: the least gap that is looked at
 MOVED = 0.5  # share of the way that a speed gives over a gap, below which the gap was none
+UNEVEN = 0.2  # of the rows of a stream without a rate
 LEAST = 0.1  # m or rad of that way; m/s or rad/s of a speed that changes
 SETTLED = 3.0  # s after the last command in which a vehicle may still follow it
 CHANGED = 0.3  # of the usual range of a speed, in which it changes by itself at most
@@ -32,13 +33,48 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
         found.append(f"command: in {len(cut)} of {len(trials)} trials ({name}) the commands end {rest:.1f} s before "
                      "the odometry, and the vehicle goes on to change its speed: the rest of them was not recorded. "
                      "Cut the trial where they end, or record all of them.")
+    return [*found, *outages(trials)]
+
+
+def set_forward(trials: Sequence[Trial]) -> list[str]:
+    """A sentence on clocks that were set forward in a drive. Nothing else that looks odd then says anything."""
     jumps = [(trial.name, *jump) for trial in trials if (jump := forward_jump(trial)) is not None]
-    if jumps:
-        name, at, seconds = jumps[0]
-        found.append(f"time: in {len(jumps)} of {len(trials)} trials ({name}, at {at:.1f} s) t jumps ahead by "
-                     f"{seconds:.2g} s in which the vehicle hardly moved, though it drives before and after: the clock "
-                     "was set forward. Split the trial there, or take the jump out of all of its streams.")
-    return found
+    paused = [trial for trial in trials if _outage(trial) is not None and forward_jump(trial) is None]
+    if len(jumps) <= len(paused):  # in some pauses of a recording the vehicle happens to be slow
+        return []
+    name, at, seconds = jumps[0]
+    return [f"time: in {len(jumps)} of {len(trials)} trials ({name}, at {at:.1f} s) t jumps ahead by {seconds:.2g} s "
+            "in which the vehicle hardly moved, though it drives before and after: the clock was set forward. Split "
+            "the trial there, or take the jump out of all of its streams."]
+
+
+def outages(trials: Sequence[Trial]) -> list[str]:
+    """A sentence on drives that nothing was recorded of for a while, commands neither."""
+    found = [(trial.name, *outage) for trial in trials if (outage := _outage(trial)) is not None]
+    if not found:
+        return []
+    name, begin, end = found[0]
+    return [f"time: in {len(found)} of {len(trials)} trials ({name}, from {begin:.1f} to {end:.1f} s) no stream has a "
+            "row, commands neither, though they come regularly otherwise: the recording paused, and what was sent "
+            "meanwhile is unknown. Split the trial there."]
+
+
+def _outage(trial: Trial) -> tuple[float, float] | None:
+    """Begin and end [s] of the longest time for which all streams pause that come regularly; None without one."""
+    streams = [one.t for one in (trial.command, trial.odometry, trial.ground_truth) if one is not None]
+    if len(streams) < 2 or any(len(t) < 20 or _uneven(t) for t in streams):
+        return None
+    rows = np.sort(np.concatenate(streams))
+    k = int(np.argmax(np.diff(rows)))
+    begin, end = float(rows[k]), float(rows[k + 1])
+    longest = max(float(np.median(np.diff(t))) for t in streams)
+    return (begin, end) if end - begin > max(PAUSE[0], PAUSE[1] * longest) else None
+
+
+def _uneven(t: np.ndarray) -> bool:
+    """Whether most rows do not come at one rate, as commands that are sent where they change."""
+    steps = np.diff(t)
+    return bool(np.mean(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) > UNEVEN)
 
 
 def pauses(trials: Sequence[Trial]) -> list[str]:

@@ -56,3 +56,13 @@ def test_figures_of_another_machine_are_taken_unless_older_and_only_those_asked_
     assert values(here) == {"a": 2, "b": 1, "c": 3, "d": 2}
     with pytest.raises(ValueError, match="no figure e; it has a, c"):
         merge(there, here.parent, only=["e"])
+
+
+@pytest.mark.parametrize("figures", [{"a": 3}, {"a": {"unit": "s"}}, {"a": None}, []])
+def test_what_is_no_result_file_is_not_merged(figures, tmp_path):
+    source = tmp_path / "new" / "speed.json"
+    source.parent.mkdir()
+    source.write_text(json.dumps({"figures": figures}))
+    with pytest.raises(ValueError, match=f"{source}: (figure 'a' has no value|has no figures)"):
+        merge(source, tmp_path)
+    assert not (tmp_path / "speed.json").exists()

@@ -28,6 +28,7 @@ from sysid.replay.model_files import load_model
 from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import default_paths, resolve, write_mjcf
+from sysid.run_folder import file_label
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.manoeuvres import Scenario, command_table
@@ -331,6 +332,21 @@ def test_meshes_are_found_where_packages_usually_have_them(tmp_path, cube, named
 
 
 @pytest.mark.quick
+def test_another_mesh_or_included_file_makes_another_run(tmp_path, cube):
+    path, mesh = tmp_path / "cart.urdf", tmp_path / "body.stl"
+    path.write_text(URDF.replace("</inertial>", "</inertial>" + BODY.format("body.stl"), 1))
+    mesh.write_bytes(cube)
+    (tmp_path / "part.xml").write_text(ROBOT)
+    whole = tmp_path / "whole.xml"
+    whole.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    before, one = file_label(path), file_label(whole)
+    assert file_label(path) == before  # it is the same each time
+    mesh.write_bytes(cube.replace(np.float32(0.1).tobytes(), np.float32(0.2).tobytes()))
+    assert file_label(path) != before
+    (tmp_path / "part.xml").write_text(ROBOT.replace('mass="0.5"', 'mass="0.6"'))
+    assert file_label(whole) != one
+
+
 @pytest.mark.parametrize("content", [None, b"solid body\n facet normal 0 0 1\n", b"", b"not a mesh"])
 def test_a_mesh_that_is_missing_or_unreadable_becomes_a_box_of_its_links_inertia_with_a_note(tmp_path, content):
     path = tmp_path / "cart.urdf"

@@ -156,3 +156,67 @@ def test_windows_of_a_long_drive_can_be_held_out(tmp_path):
     log = load_any(write(tmp_path, "", trial, pose), train=("whole:0-0.6",), held_out=("whole:0.6-1",))
     names = [one.name for one in (*log.training, *log.held_out)]
     assert names == [f"whole/{k:03d}" for k in range(len(names))] and len(log.training) > len(log.held_out) > 1
+
+
+def paused(stream, begin, end):
+    """A stream without its rows in a time."""
+    kept = (stream.t < begin) | (stream.t > end)
+    return type(stream)(*(getattr(stream, one)[kept] for one in stream.__dataclass_fields__))
+
+
+@pytest.mark.parametrize(("streams", "named"), [
+    (("command", "odometry", "ground_truth"), True), (("odometry", "ground_truth"), False), (("odometry",), False),
+])  # fmt: skip
+def test_a_time_of_which_nothing_was_recorded_is_named(streams, named):
+    trial = drive()
+    gappy = replace(trial, **{one: paused(getattr(trial, one), 10.3, 14.1) for one in streams})
+    assert [one for one in sanity(log_of(gappy)) if "the recording paused" in one] == [
+        "time: in 1 of 1 trials (a, from 10.3 to 14.1 s) no stream has a row, commands neither, though they come "
+        "regularly otherwise: the recording paused, and what was sent meanwhile is unknown. Split the trial there."
+    ] * named
+
+
+def test_commands_that_come_only_where_they_change_are_no_pause_of_the_recording():
+    trial = drive()
+    seldom = Command(*(one[::HELD] for one in (trial.command.t, trial.command.v, trial.command.omega)))
+    gappy = {one: paused(getattr(trial, one), 10.3, 11.4) for one in ("odometry", "ground_truth")}
+    assert not any("recording paused" in one for one in sanity(log_of(replace(trial, command=seldom, **gappy))))
+
+
+def test_of_a_clock_that_was_set_forward_nothing_else_is_said():
+    trial = drive()
+    jumped = {one: replace(stream, t=stream.t + 3600.0 * (stream.t > 15.0)) for one in (
+        "command", "odometry", "ground_truth") if (stream := getattr(trial, one)) is not None}
+    (said,) = sanity(log_of(replace(trial, **jumped)))
+    assert "the clock was set forward" in said
+
+
+def test_a_jump_of_the_outside_pose_is_no_motion_of_the_vehicle():
+    trial = drive(size=0.5)
+    rest = trial.odometry.t > 20.0  # it comes to rest
+    still = OdometryStream(trial.odometry.t, *(np.where(rest, one[~rest][-1], one) for one in (
+        trial.odometry.x, trial.odometry.y, trial.odometry.yaw)), *(np.where(rest, 0.002, one) for one in (
+            trial.odometry.v, trial.odometry.omega)))
+    pose = PoseStream(*(one[::5] for one in (still.t, still.x, still.y, still.yaw)))
+    jumpy = replace(pose, x=pose.x + 2.0 * (pose.t > 25.0))
+    stopped = Command(trial.command.t, *(one * (trial.command.t < 19.8) for one in (
+        trial.command.v, trial.command.omega)))
+    said = sanity(log_of(replace(trial, odometry=still, ground_truth=jumpy, command=stopped)))
+    assert any("ground_truth" in one and "jumps by 2.00 m" in one for one in said)
+    assert not any("its rows repeat" in one for one in said)
+
+
+def test_a_frame_whose_z_points_down_is_named():
+    trial = drive()
+    down = replace(trial.ground_truth, y=-trial.ground_truth.y, yaw=-trial.ground_truth.yaw)
+    (said,) = sanity(log_of(replace(trial, ground_truth=down)))
+    assert "z of its frame points down (NED): negate y and yaw" in said
+
+
+@pytest.mark.parametrize("name", ["odometry", "ground_truth"])
+def test_of_two_clocks_that_come_apart_the_faster_ones_gain_shows_no_unit(name):
+    trials = [drive(f"a_{seed}", seconds=40.0, seed=seed, gain=0.47) for seed in range(2)]
+    fast = [replace(one, **{name: replace(getattr(one, name), t=1.12 * getattr(one, name).t)}) for one in trials]
+    assert sanity(log_of(*trials)) == []
+    (said,) = sanity(log_of(*fast))
+    assert re.match("(ground_truth|odometry): its clock runs", said)

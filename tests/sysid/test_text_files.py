@@ -140,6 +140,40 @@ def test_wheel_speeds_of_any_unit_are_an_odometry_beside_commands(tmp_path, name
     assert log.trials[0].duration == pytest.approx(DRIVE.duration, abs=0.1)
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_wheel_that_counts_backwards_is_named_and_turned_by_a_flag(tmp_path, side):
+    c = columns()
+    turned = {"left": c["v"] - 0.248 * c["w"], "right": c["v"] + 0.248 * c["w"]}
+    turned[side] = -turned[side]
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"],
+                                          "wheel_left": turned["left"], "wheel_right": turned["right"]})
+    with pytest.raises(ValueError, match=f"the {side} wheel counts backwards.*--columns wheels.{side}=.*:-") as error:
+        convert(ConvertConfig(path, tmp_path / "log"))
+    remedy = str(error.value).rpartition(" ")[2]
+    log, _ = convert(ConvertConfig(path, tmp_path / "log", columns=(remedy,)))
+    check(log.trials[0], pose=False)
+    assert f"{remedy}m/s" in log.fields["columns"]
+    again, _ = convert(ConvertConfig(path, tmp_path / "again", columns=tuple(log.fields["columns"])))
+    check(again.trials[0], pose=False)
+
+
+def test_a_file_of_too_few_rows_is_named_where_it_leaves_no_drive(tmp_path):
+    c = columns()
+    write(tmp_path / "drive" / "odom.csv", {name: c[name] for name in ("t", "x", "y", "yaw", "v", "w")})
+    (tmp_path / "drive" / "cmd_vel.csv").write_text("t,v,omega\n0,0.3,0.2\n")
+    with pytest.raises(ValueError, match="neither commands.*Left out before: .*cmd_vel.csv: 1 row; at least 10"):
+        convert(ConvertConfig(tmp_path / "drive", tmp_path / "log"))
+
+
+def test_a_quaternion_by_which_the_vehicle_lies_on_its_side_is_named(tmp_path):
+    c = columns()
+    first = dict(zip(("qx", "qy", "qz", "qw"), np.roll(list(quaternion(c["gyaw"]).values()), 1, axis=0), strict=True))
+    table = {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"], "gt_x": c["gx"], "gt_y": c["gy"],
+             **{f"gt_{name}": values for name, values in first.items()}}
+    _, notes = convert(ConvertConfig(write(tmp_path / "drive.csv", table), tmp_path / "log"))
+    assert any("lies on its side in ground_truth" in one and "order w, x, y, z" in one for one in notes)
+
+
 def test_ticks_of_wheels_need_their_number_in_a_turn(tmp_path):
     c = columns()
     angle = np.cumsum((c["v"] - c["w"] * 0.248) / 0.1325) * np.median(np.diff(c["t"]))

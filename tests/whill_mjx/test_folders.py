@@ -11,7 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from whill_mjx.io.folders import FolderRefused, check_place, claim_folder, new_folder, write_whole
+from whill_mjx.io.folders import (
+    FolderRefused,
+    check_file,
+    check_place,
+    claim_folder,
+    new_folder,
+    note_written,
+    write_whole,
+)
 
 pytestmark = pytest.mark.quick
 KIND = "whill_mjx.test"
@@ -145,3 +153,35 @@ def test_a_new_folder_appears_whole_and_leftovers_of_killed_processes_are_remove
 def test_a_text_with_the_name_of_a_file_that_is_not_utf_8_is_written(tmp_path):
     write_whole(tmp_path / "page.html", f"of {os.fsdecode(b'caf' + bytes([0xe9]))}, 日本")
     assert (tmp_path / "page.html").read_text(encoding="utf-8") == "of caf?, 日本"
+
+
+def test_a_file_is_replaced_only_while_it_is_as_a_command_wrote_it(tmp_path):
+    path = tmp_path / "next.csv"
+    check_file("--out", path)
+    write_whole(path, "t,v,omega\n")
+    note_written(path)
+    check_file("--out", path)  # the same command again
+    path.write_text("t,v,omega\n0,1,0\n")  # somebody edits it
+    with pytest.raises(FolderRefused, match=f"--out {path}: exists already, and is not as a command"):
+        check_file("--out", path)
+    path.unlink()
+    check_file("--out", path)
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"{", b"\xff", b'{"mine.csv": 3}'])
+def test_a_damaged_account_of_files_makes_them_somebodys(tmp_path, content):
+    path = tmp_path / "mine.csv"
+    path.write_text("mine")
+    (tmp_path / ".written.json").write_bytes(content)
+    with pytest.raises(FolderRefused, match="exists already"):
+        check_file("--out", path)
+    note_written(path)
+    check_file("--out", path)
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "folder.csv").mkdir()
+    for name, said in (("pipe.csv", "exists already"), ("folder.csv", "is a folder")):
+        with pytest.raises(FolderRefused, match=said):
+            check_file("--out", tmp_path / name)

@@ -7,8 +7,9 @@ import shlex
 import marker_seeker
 import pytest
 
-from whill_mjx import drive, evaluate, export_mjcf, export_python, look, view
+from whill_mjx import drive, evaluate, export_mjcf, export_python, look, maps, view
 from whill_mjx.io import command_line
+from whill_mjx.logs import paths
 
 pytestmark = pytest.mark.quick
 COMMANDS = {
@@ -17,6 +18,8 @@ COMMANDS = {
     "export_mjcf": (export_mjcf.Options, export_mjcf.main, True),
     "export_python": (export_python.Options, export_python.main, True),
     "view": (view.ViewOptions, view.main, False),
+    "maps": (maps.Import, maps.main, True),
+    "paths": (paths.PathOptions, paths.main, True),
     "evaluate": (evaluate.EvaluateOptions, evaluate.main, False),
 }
 
@@ -68,7 +71,7 @@ def mistaken(command, words, capsys):
     ("export_python", "whill_cr --physics-dt nan", "--physics-dt nan: must be at least 0.0001"),
     ("export_python", "nope", "unknown vehicle 'nope'"),
     ("export_python", "whill_cr --out vehicle.txt", "--out vehicle.txt: must be a file that ends in .py"),
-    ("export_python", "whill_cr --out folder.py", "--out folder.py: must be a file that ends in .py"),
+    ("export_python", "whill_cr --out folder.py", "--out folder.py: is a folder"),
     ("export_python", "whill_cr --out file/new.py", "file is a file, not a folder"),
     ("view", "", "RUN: none is given"),
     ("view", "nowhere", "RUN nowhere: no such folder"),
@@ -76,6 +79,12 @@ def mistaken(command, words, capsys):
     ("view", "empty", "RUN empty: holds no run"),
     ("view", "training --out file", "--out file: must be a file that ends in .html"),
     ("view", "training --out file/new.html", "file is a file, not a folder"),
+    ("look", "--out mine.png", "--out mine.png: exists already, and is not as a command of this project wrote it"),
+    ("look", "--scene all --out the.png", "the_corridor.png: exists already"),
+    ("export_python", "whill_cr --out mine.py", "--out mine.py: exists already"),
+    ("view", "training --out mine.html", "--out mine.html: exists already"),
+    ("maps", "map.yaml --out mine", "--out mine.png: exists already"),
+    ("paths", "command.csv whill_cr --out mine.csv", "--out mine.csv: exists already"),
     ("view", "training --embed-mb -1", "--embed-mb -1.0: must be at least 0"),
     ("view", "training --serve --port 70000", "--port 70000: must be at least 0 and at most 65535"),
     ("evaluate", "nowhere", "nowhere"),
@@ -137,6 +146,8 @@ def mistaken(command, words, capsys):
 def test_a_mistake_ends_with_one_line_and_code_2(command, words, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
+    for name in ("mine.png", "the_corridor.png", "mine.py", "mine.html", "mine.npz", "mine.csv"):
+        (tmp_path / name).write_text("somebody's")
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "folder.py").mkdir()
     (tmp_path / "empty").mkdir()

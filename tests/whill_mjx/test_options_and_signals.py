@@ -181,6 +181,18 @@ SWALLOWS = """
 """
 
 
+LOGS = """
+    import logging
+    print("begun", flush=True)
+    try:  # as JAX does where it looks for its plugins
+        time.sleep(60)
+    except BaseException:
+        logging.getLogger("jax._src.xla_bridge").exception("a plugin failed")
+    time.sleep(60)
+    open("{after}", "w").close()
+"""
+
+
 COLLECTS = """
     import gc
     gc.callbacks.append(lambda phase, about: time.sleep(0.2))
@@ -191,8 +203,8 @@ COLLECTS = """
 """
 
 
-@pytest.mark.parametrize("body", [COMPILES, SWALLOWS, COLLECTS],
-                         ids=["XLA compiles", "the work swallows the interrupt", "Python collects garbage"])
+@pytest.mark.parametrize("body", [COMPILES, SWALLOWS, LOGS, COLLECTS], ids=[
+    "XLA compiles", "the work swallows the interrupt", "a library logs the interrupt", "Python collects garbage"])
 def test_a_signal_ends_the_process_where_no_handler_can(body, tmp_path):
     after = tmp_path / "after"
     assert ended(started(body.format(after=after)), signal.SIGINT) == (130, "stopped; go on so. (SIGINT)")

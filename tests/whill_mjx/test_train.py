@@ -306,6 +306,16 @@ def test_a_folder_with_somebodys_files_is_refused_before_the_training(tmp_path, 
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize("identity", ["{}", '{"seed": NaN}', '{"data": [1]}', '{"vehicle": {}}'])
+def test_a_folder_whose_identity_lacks_what_every_training_has_is_refused(identity, tmp_path):
+    (tmp_path / "run.json").write_text(f'{{"kind": "whill_mjx.train", "identity": {identity}}}')
+    before = contents(tmp_path)
+    with pytest.raises(FolderRefused, match="run.json does not say which run this is: it has no (data|vehicle)"):
+        main(TrainOptions(out=tmp_path, vehicle=Path("whill_cr"), preset="smoke"))
+    assert {**contents(tmp_path), ".lock": b""} == {**before, ".lock": b""}
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize("words, told", [
     ("--steps 0", "--steps 0: must be at least 1"), ("--seed -1", "--seed -1: must be at least 0"),
     ("--lr nan", "--lr nan: must be above 0"), ("--lr -1", "--lr -1"), ("--episodes 0", "--episodes 0"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import io
+import logging
 import math
 import os
 import select
@@ -28,6 +29,8 @@ from whill_mjx.processor import keep_results_apart, share_results
 GRACE_S = 1.2
 """Time from a signal to the end of the process, whatever it computes meanwhile."""
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+SWALLOWING = "jax._src.xla_bridge"
+"""Logger of what starts JAX's devices, which catches any exception of a plugin and logs its traceback."""
 STOPPED = "stopped; every file is whole or absent. Give the same command again."
 DONE, FAILED, REFUSED, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
 FRAME = " \t-─━│┃╭╮╰╯"
@@ -356,6 +359,7 @@ def listen() -> None:
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     _State.wakeup = reader, writer
     _State.hook, sys.unraisablehook = sys.unraisablehook, _unraisable
+    logging.getLogger(SWALLOWING).addFilter(_is_news)
     threading.Thread(target=_watch, args=(reader,), daemon=True, name="signals").start()
 
 
@@ -364,6 +368,11 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     if not _State.working:
         leave(_State.stopped)
     raise KeyboardInterrupt
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Whether a library logs anything but an interrupt that it caught: then the watching thread ends the process."""
+    return not (record.exc_info and record.exc_info[0] is KeyboardInterrupt)
 
 
 def _unraisable(what: Any) -> None:

@@ -9,6 +9,7 @@ The lock is the operating system's: it ends with the process that holds it, howe
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -25,6 +26,8 @@ from whill_mjx.io.reading import read_json
 RUN_FILE = "run.json"
 """Kind and identity of what a folder holds, written once."""
 LOCK_FILE = ".lock"
+WRITTEN_FILE = ".written.json"
+"""Checksum of each single file that a command wrote into a folder: one that is still so may be replaced."""
 SHOWN = 6
 """Differences between two runs that an error names."""
 LEAST_FREE = 4_000_000
@@ -67,6 +70,38 @@ def write_whole(path: Path, content: str | bytes) -> None:
     """
     with whole_file(path) as temporary:
         temporary.write_bytes(content.encode(errors="replace") if isinstance(content, str) else content)
+
+
+def check_file(option: str, path: Path) -> None:
+    """Raise FolderRefused where a file cannot be written at `path`, or is there and not as `note_written` knows it."""
+    check_place(option, path)
+    if path.is_dir():
+        raise FolderRefused(f"{option} {path}: is a folder. Give the name of a file.")
+    if path.exists() and (not path.is_file() or _written(path.parent).get(path.name) != _checksum(path)):
+        raise FolderRefused(f"{option} {path}: exists already, and is not as a command of this project wrote it. It is "
+                            "not replaced: choose another name, or remove it.")
+
+
+def note_written(*paths: Path) -> None:
+    """Remember files that were written, so that the same command may replace them while nobody has changed them."""
+    for path in paths:
+        with suppress(OSError):
+            write_whole(path.parent / WRITTEN_FILE, json.dumps(
+                {**_written(path.parent), path.name: _checksum(path)}, indent=1) + "\n")
+
+
+def _written(folder: Path) -> dict[str, Any]:
+    """Name -> checksum of the files in a folder that commands wrote; empty where this cannot be read."""
+    try:
+        found = read_json(folder / WRITTEN_FILE, "missing.", "")
+    except (ValueError, OSError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _checksum(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def check_place(option: str, path: Path, least_free: int = LEAST_FREE) -> None:

@@ -56,7 +56,8 @@ def read_bytes(path: str | Path, limit: int, missing: str) -> bytes:
     path = Path(path)
     try:
         if not path.is_file():
-            raise FileNotFoundError(f"{path}: {missing}")
+            what = "is a folder, not a file: " if path.is_dir() else ""
+            raise FileNotFoundError(f"{path}: {what}{missing}")
         with path.open("rb") as file:
             data = file.read(limit + 1)
     except FileNotFoundError:

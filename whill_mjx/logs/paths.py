@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.io.fields import COLUMNS
+from whill_mjx.io.folders import check_file, note_written
 from whill_mjx.io.reading import read_csv
 from whill_mjx.logs.dataset import write_csv
 from whill_mjx.vehicle.config import VehicleConfig
@@ -148,6 +149,7 @@ def read_table(path: Path) -> np.ndarray:
 def main(options: PathOptions) -> None:
     """Simulate and write the paths."""
     with refusing():
+        check_file("--out", options.out)
         table = read_table(options.commands)
         spec, params, _ = load_vehicle(options.vehicle)
         intervals = load_intervals(options.vehicle) if options.vehicle.endswith(".toml") else {}
@@ -157,6 +159,7 @@ def main(options: PathOptions) -> None:
     paths = simulate_paths(spec, params, names, values, table, options.seed)
     numbers = np.repeat(np.arange(len(paths)), paths.shape[1])
     write_csv(options.out, HEADER, np.column_stack([numbers, paths.reshape(-1, 4)]))
+    note_written(options.out)
     print(f"{options.out}: {len(paths)} paths, {len(names)} parameters drawn")
 
 

@@ -1,0 +1,255 @@
+"""The vehicle's pose out of transforms between frames (/tf, /tf_static), chained link by link.
+
+A pose in `odom` is odometry. One in `map`, `world` or another fixed frame is an outside pose. Links may be used
+against their direction, as where a lidar odometry publishes `odom` as a child of the base.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from whill_mjx.io.fields import shown
+
+KINDS = ("TFMessage", "tfMessage")
+BASES = ("base_footprint", "base_link", "base", "base_frame", "chassis", "robot", "robot_base")
+"""Names of the frame that moves with the vehicle, the first found is taken."""
+FIXED = ("map", "world", "earth", "mocap", "vicon", "optitrack", "qualisys", "global", "utm")
+"""Names of frames that stand still outside of the vehicle."""
+DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
+STANDING = 1e-6  # m, and of a quaternion, that a link may change by and not count as moving
+LISTED = 12  # links that an error names
+
+
+class NoChain(ValueError):
+    """Frames without the chain that is needed."""
+
+
+@dataclass
+class Links:
+    """Every transform of a recording: (parent, child) -> rows of receipt, stamp [s], x, y, z [m], qx, qy, qz, qw."""
+
+    rows: dict[tuple[str, str], list[tuple[float, ...]]] = field(default_factory=dict)
+    unset: int = 0
+    """Transforms that are left out, whose numbers are not finite or whose quaternion is zero."""
+
+    def add(self, received: float, message: Any) -> None:
+        """Take the transforms of a message."""
+        for one in message.transforms:
+            moved, turned = one.transform.translation, one.transform.rotation
+            row = tuple(map(float, (moved.x, moved.y, moved.z, turned.x, turned.y, turned.z, turned.w)))
+            if not np.isfinite(row).all() or sum(map(abs, row[3:])) < 1e-6:
+                self.unset += 1
+                continue
+            key = str(one.header.frame_id).strip("/"), str(one.child_frame_id).strip("/")
+            stamp = one.header.stamp.sec + one.header.stamp.nanosec * 1e-9
+            self.rows.setdefault(key, []).append((received, stamp, *row))
+
+    def frames(self) -> list[str]:
+        """Names of all frames."""
+        return list(dict.fromkeys(frame for key in self.rows for frame in key))
+
+    def __str__(self) -> str:
+        """The links, as errors show them."""
+        listed = [f"{shown(parent)} to {shown(child)}" for parent, child in self.rows]
+        return ", ".join(listed[:LISTED]) + (f" and {len(listed) - LISTED} more" if len(listed) > LISTED else "")
+
+
+@dataclass(frozen=True)
+class Chained:
+    """Pose of one frame in another."""
+
+    parent: str
+    child: str
+    received: np.ndarray  # (T,) s
+    stamped: np.ndarray  # (T,) s
+    pose: np.ndarray  # (T, 3) x, y [m], yaw [rad]
+
+    def with_speeds(self) -> np.ndarray:
+        """(T, 5) the pose and its forward speed and yaw rate."""
+        t = self.stamped if (self.stamped > 0).all() and (np.diff(self.stamped) > 0).all() else self.received
+        order = np.argsort(t, kind="stable")
+        rising = order[np.append(True, np.diff(t[order]) > 1e-6)]
+        x, y, yaw = self.pose[rising].T
+        speeds = pose_speeds(t[rising], x, y, np.unwrap(yaw))
+        return np.column_stack([self.pose, *(np.interp(t, t[rising], one) for one in speeds)])
+
+
+def base_frame(links: Links) -> str:
+    """The frame that moves with the vehicle.
+
+    Raises:
+        NoChain: there is none, or several have its name.
+    """
+    for name in BASES:
+        found = [frame for frame in links.frames() if _last(frame) == name]
+        if len(found) > 1:
+            raise NoChain(f"{', '.join(map(shown, found))} may be the vehicle's frame (frames: {links})")
+        if found:
+            return found[0]
+    moving = [child for (_, child), rows in links.rows.items() if _moves(rows)]
+    ends = [frame for frame in moving if not any(parent == frame for parent, _ in links.rows)]
+    if len(ends) != 1:
+        raise NoChain(f"no frame is called {', '.join(BASES[:3])} (frames: {links or 'none'})")
+    return ends[0]
+
+
+def odometry_frame(links: Links, base: str) -> str | None:
+    """The frame in which the odometry counts; None where none is linked with the base."""
+    able = [frame for frame in links.frames() if "odom" in _last(frame).lower() and chain(links, frame, base)]
+    return next((frame for frame in able if _last(frame) == "odom"), able[0] if able else None)
+
+
+def outside_frame(links: Links, base: str) -> str | None:
+    """The fixed frame in which the base is known, besides the odometry's; None where there is none."""
+    able = [frame for frame in links.frames() if frame != base and "odom" not in _last(frame).lower()
+            and chain(links, frame, base)]
+    for name in FIXED:
+        if found := [frame for frame in able if _last(frame).lower() == name]:
+            return found[0]
+    children = {child for _, child in links.rows}
+    roots = [frame for frame in able if frame not in children]
+    return roots[0] if roots and any(_moves(links.rows[key]) for key, _ in chain(links, roots[0], base) or ()) else None
+
+
+def chain(links: Links, parent: str, child: str) -> list[tuple[tuple[str, str], bool]] | None:
+    """The links from `parent` to `child`, the fewest, and whether each is used along its direction; None without."""
+    came: dict[str, tuple[str, tuple[str, str], bool]] = {}
+    waiting = deque([parent])
+    while waiting and child not in came:
+        here = waiting.popleft()
+        for key in links.rows:
+            if here in key and (there := key[1] if here == key[0] else key[0]) not in (parent, *came):
+                came[there] = here, key, here == key[0]
+                waiting.append(there)
+    if child not in came:
+        return None
+    found = []
+    while child != parent:
+        child, key, along = came[child]
+        found.append((key, along))
+    return found[::-1]
+
+
+def pose_of(links: Links, parent: str, child: str) -> Chained:
+    """The pose of a frame in another, each time that the link which moves most often was sent.
+
+    Other moving links are interpolated to these times, as tf2 does. Before one of them was first sent there is no pose.
+
+    Raises:
+        NoChain: no links connect them, or none of these moves.
+    """
+    found = chain(links, parent, child)
+    if found is None:
+        raise NoChain(f"no links lead from {shown(parent)} to {shown(child)} (frames: {links})")
+    tables = {key: _sorted(np.array(links.rows[key])) for key, _ in found}
+    moving = [key for key, _ in found if len(tables[key]) > 1 and _moves(links.rows[key])]
+    clock = tables[max(moving or tables, key=lambda key: len(tables[key]))]
+    if len(clock) < 2:
+        raise NoChain(f"{shown(child)} in {shown(parent)} was sent once: it never moves (frames: {links})")
+    by_stamp = all((tables[key][:, 1] > 0).all() for key in moving)
+    t = clock[:, 1 if by_stamp else 0]
+    first = max((tables[key][0, 1 if by_stamp else 0] for key in moving), default=t[0])
+    kept = t >= first - 1e-6
+    place, turn = np.zeros((kept.sum(), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (kept.sum(), 1))
+    for key, along in found:
+        table = tables[key] if key in moving else tables[key][:1]
+        moved, turned = _at(table[:, 1 if by_stamp else 0], table[:, 2:], t[kept])
+        if not along:
+            turned = turned * [-1.0, -1.0, -1.0, 1.0]
+            moved = -_rotated(turned, moved)
+        place, turn = place + _rotated(turn, moved), _product(turn, turned)
+    x, y, z, w = turn.T
+    yaw = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return Chained(parent, child, clock[kept, 0], clock[kept, 1], np.column_stack([place[:, :2], yaw]))
+
+
+def chosen_poses(links: Links, asked: dict[str, str], wanted: Iterable[str], notes: list[str]) -> dict[str, Chained]:
+    """The poses that stand for streams.
+
+    Args:
+        asked: stream -> "" or "PARENT:CHILD", as the caller named it.
+        wanted: further streams, of which the one that there is may be taken.
+        notes: what was chosen is added.
+
+    Raises:
+        NoChain: naming the frames.
+    """
+    if links.unset:
+        notes.append(f"{links.unset} transforms whose numbers are not finite, or with an orientation that is all zero, "
+                     "are left out")
+    found = {}
+    for stream, frames in asked.items():
+        parent, _, child = frames.partition(":")
+        child = child.strip("/") or base_frame(links)
+        named = parent.strip("/") or (odometry_frame if stream == "odometry" else outside_frame)(links, child)
+        if named is None:
+            raise NoChain(f"no frame of the {'odometry' if stream == 'odometry' else 'room'} leads to {shown(child)} "
+                          f"(frames: {links})")
+        found[stream] = pose_of(links, named, child)
+    wanted = [stream for stream in wanted if stream not in found]
+    if not found and wanted:
+        base = base_frame(links)
+        odometry, outside = odometry_frame(links, base), outside_frame(links, base)
+        if "odometry" in wanted and odometry is not None:
+            found["odometry"] = pose_of(links, odometry, base)
+            if "ground_truth" in wanted and outside is not None:
+                notes.append(f"no outside pose is taken. {shown(base)} in {shown(outside)} may be one: --truth-topic "
+                             f"/tf:{outside}:{base}, if it measures the vehicle from outside")
+        elif "ground_truth" in wanted and outside is not None:
+            found["ground_truth"] = pose_of(links, outside, base)
+        else:
+            raise NoChain(f"no links lead from odom, map or world to {shown(base)} (frames: {links})")
+    for stream, one in found.items():
+        more = f"; v and omega are its differences over {DIFFERENCED:g} s" if stream == "odometry" else ""
+        notes.append(f"{stream} is {shown(one.child)} in {shown(one.parent)}, of the transforms{more}")
+    return found
+
+
+def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Forward speed and yaw rate (T,) of a pose (T,) whose yaw does not wrap, over `DIFFERENCED` seconds."""
+    half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
+    low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
+    dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
+    return (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
+
+
+def _last(frame: str) -> str:
+    """The name of a frame without its namespace."""
+    return frame.rpartition("/")[2]
+
+
+def _moves(rows: Sequence[tuple[float, ...]]) -> bool:
+    return bool(len(rows) > 1 and np.ptp(np.array(rows)[:, 2:], axis=0).max() > STANDING)
+
+
+def _sorted(table: np.ndarray) -> np.ndarray:
+    """Rows in order of their stamps where these are set, else of receipt."""
+    return table[np.argsort(table[:, 1] if (table[:, 1] > 0).all() else table[:, 0], kind="stable")]
+
+
+def _at(when: np.ndarray, moved: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Translation (T, 3) and quaternion (T, 4) of a link at times t (T,), between its rows; at its end it stays."""
+    turns = moved[:, 3:] / np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
+    flips = np.cumprod(np.append(1.0, np.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0)))
+    turns = turns * flips[:, None]  # of the two quaternions of a turn the one near the last
+    columns = np.stack([np.interp(t, when, one) for one in (*moved[:, :3].T, *turns.T)], axis=1)
+    turned = columns[:, 3:]
+    return columns[:, :3], turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def _rotated(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors (T, 3) turned by quaternions (T, 4)."""
+    axis, w = turn[:, :3], turn[:, 3:]
+    cross = 2 * np.cross(axis, vector)
+    return np.asarray(vector + w * cross + np.cross(axis, cross))
+
+
+def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Products (T, 4) of quaternions (T, 4)."""
+    a, b, w, v = one[:, :3], other[:, :3], one[:, 3:], other[:, 3:]
+    return np.column_stack([w * b + v * a + np.cross(a, b), w * v - (a * b).sum(1, keepdims=True)])
