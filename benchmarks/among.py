@@ -38,6 +38,7 @@ from whill_mjx.learning.setup import (
 from whill_mjx.learning.trainings import Trained
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.among_people import SENSES
+from whill_mjx.tasks.options import read_fields
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 from whill_mjx.world.maps import make_map_scene, read_map
 from whill_mjx.world.maps.several import side_by_side
@@ -111,8 +112,8 @@ def train(preset: Preset, seed: int, folder: Path, minutes: float) -> dict[str, 
     env, config = functional_env(batch, preset.safety), preset.ppo
     began = time.monotonic()
     state = jax.jit(lambda seed: ppo.init_state(env, config, seed))(np.int32(seed))
-    program = jax.jit(lambda state, total: ppo.iterate(env, config, total, state), donate_argnums=0)
-    program = program.lower(state, np.int32(1)).compile()
+    iterate = jax.jit(lambda state, total: ppo.iterate(env, config, total, state), donate_argnums=0)
+    program = iterate.lower(state, np.int32(1)).compile()
     compiled_s, began = time.monotonic() - began, time.monotonic()
     each, done, spent, logged = env.num_envs * config.rollout, 0, 0.0, 0.0
     with (folder / "metrics.jsonl").open("w") as log:
@@ -143,9 +144,11 @@ def judged_driver(preset: Preset, course: Course, params: Any) -> tuple[Driver, 
     """The policy, and its first memory, whose number of a sight says what it is shown: one program judges them all."""
     step, carry = ppo_policy(preset, course.env.model.config.control_dt, course.env)
     readings = {name: sensor.reading(course.env) for name, sensor in course.env.sensors}
-    empty = {name: jnp.zeros(one.shape, one.dtype) for name, one in readings.items()}
-    unseen = {name: jnp.full_like(empty[name], 0 if name == "camera" else readings[name].high)
-              for name in ("camera", "lidar") if name in empty}  # fmt: skip
+    empty: dict[str, jax.Array] = {name: jnp.zeros(one.shape, one.dtype) for name, one in readings.items()}
+    unseen: dict[str, jax.Array] = {}
+    for name in ("camera", "lidar"):
+        if name in empty:
+            unseen[name] = jnp.full_like(empty[name], 0 if name == "camera" else readings[name].high)
 
     def act(weights: Any, memory: Any, state: Any, seen: dict[str, jax.Array], key: jax.Array) -> tuple[Any, jax.Array]:
         carry, first, begun, sight = memory
@@ -162,7 +165,7 @@ def judged_driver(preset: Preset, course: Course, params: Any) -> tuple[Driver, 
 
 def judge(options: Options, preset: Preset, params: Any) -> dict[str, Any]:
     """Shares of the endings in the unseen maps, with each sight, all maps together and each alone."""
-    task = dataclasses.replace(preset.task, map=maps_of(options, options.unseen))
+    task = dataclasses.replace(preset.task, **read_fields(preset.task, (f"map={maps_of(options, options.unseen)}",)))
     batch = make_evaluation_env(task, VEHICLE, 1)
     course = Course(batch.env, batch.params, batch=options.episodes)
     keys = episode_keys(options.seed, options.episodes)
@@ -272,16 +275,16 @@ def main(options: Options) -> None:
             raise OptionError(f"--runs {text}: give SENSES:SEED with senses of {', '.join(SENSES)}, such as lidar:0.")
         runs.append((senses, int(seed)))
     results = []
-    for senses, seed in runs:
-        print(f"{senses}, seed {seed}", flush=True)
-        results.append(one_run(options, senses, seed))
+    for senses, number in runs:
+        print(f"{senses}, seed {number}", flush=True)
+        results.append(one_run(options, senses, number))
         figures = figures_of(results)
         path = record("environment", CLAIM, figures, options.results)
         for name in ("arrived", "collided", "bumped", "timeout", "blinded", "goal_alone"):
             one = figures[f"among_{senses}_{name}"]
             print(f"among_{senses}_{name}: {one['value']:.4f} {one['repeats']} -> {path}", flush=True)
-    for senses, seed in runs:
-        write_policy(options, senses, seed)
+    for senses, number in runs:
+        write_policy(options, senses, number)
 
 
 if __name__ == "__main__":

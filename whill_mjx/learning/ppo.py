@@ -421,5 +421,6 @@ def policy_carry(config: PpoConfig, obs_shape: Any) -> dict[str, jax.Array]:
     """Zero carry of `policy_step` for what an environment shows; of single readings nothing is kept."""
     shape = obs_shape if isinstance(obs_shape, Mapping) else {"camera": obs_shape}
     kept = empty_frames(config, shape, ())
-    images = {"frames": kept.pop("frames")[..., : -spaces.image_shape(shape)[2]]} if "frames" in kept else {}
+    image = spaces.image_shape(shape)
+    images = {"frames": kept.pop("frames")[..., : -image[2]]} if image is not None else {}
     return {**images, **kept, "begun": jnp.zeros(())} if kept and config.readings > 1 else images
