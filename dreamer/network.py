@@ -172,7 +172,8 @@ def parity(model: bytes, network: Network, steps: int) -> dict[str, Any]:
         raise ValueError(f"policy.onnx: in {steps} steps it differs from JAX by {usual:.2g} in the median and "
                          f"{worst:.2g} at most, with {flips} latent flips; rounding is {ACTION_TOLERANCE}, {RESOLVED}, "
                          f"{FLIP_SHARE:.0%} flips. Export a deterministic step that computes in float32.")
-    return {"steps": steps, "max_abs_action_difference": worst, "max_abs_action_drift": drift, "latent_flips": flips}
+    return {"steps": steps, "max_abs_action_difference": worst, "median_abs_action_difference": usual,
+            "max_abs_action_drift": drift, "latent_flips": flips}
 
 
 def _noise(rng: np.random.Generator, shape: jax.ShapeDtypeStruct) -> np.ndarray:

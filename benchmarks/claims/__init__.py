@@ -47,9 +47,9 @@ HEADLINES = (  # file, what, value
     ),
     (
         "undeclared",
-        "Hidden effects named right, at two to four times the size that could just be noticed (67 fresh logs, eight of "
-        "them with backlash, which is never named)",
-        "{class_accuracy_fresh|%} (wrong: {wrong_name_fresh|%})",
+        "Logs with one hidden effect that is named right, at two to four times the size that could just be noticed; "
+        "with two at once, both",
+        "{class_accuracy_fresh|%} (wrong: {wrong_name_fresh|%}); {pair_both_fresh|%} (wrong: {pair_wrong_fresh|%})",
     ),
     (
         "undeclared",

@@ -18,6 +18,7 @@ def _promises(content: dict[str, Any]) -> list[Row]:
         ("kills: work lost beyond a minute", "kills_lost", "{kills_lost|.kills} kills"),
         ("kills: other bits in the end", "kills_different", "{kills_different|.ended} ended runs"),
         ("kills: half-written files", "kills_half_written", "{kills_half_written|.kills} kills"),
+        ("kills: tracebacks or wrong exit codes", "kills_wrong_ends", "{kills_wrong_ends|.kills} kills"),
         ("Ctrl-C: ends without exit code 130", "ctrl_c_wrong_ends", "{ctrl_c_wrong_ends|.interrupts} interrupts"),
         ("Ctrl-C to exit, 95 % [s]", "ctrl_c_p95_s", "{ctrl_c_wrong_ends|.interrupts} interrupts"),
     )
@@ -118,7 +119,9 @@ CLAIMS = (
         BRIDGE,
         "The simulator as a robot, and the loop over topics",
         "bridge",
-        "Resets: with images that come late and out of order. Loop: contact plant behind topics, one hidden effect.",
+        "Resets: with images that come late and out of order. Loop: contact plant behind topics, one hidden effect. "
+        "Six of ten draws were finished by the present code. The other four were named by earlier code; in one of them the "
+        "held-out error rose by 94 %.",
         ("figure", "value"),
         (
             ("rows recorded at 100 Hz beside two busy processes", "{record_rows_kept|range %}"),

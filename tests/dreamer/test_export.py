@@ -271,3 +271,21 @@ def test_a_gpu_that_rounds_by_default_is_no_reason_to_refuse():
     shapes = {"h": jax.ShapeDtypeStruct((2,), np.float32)}, {"image": jax.ShapeDtypeStruct((16, 16, 3), np.uint8)}
     checked = parity(to_onnx(Network(step, *shapes)), Network(on_a_gpu, *shapes), 5)
     assert checked["max_abs_action_difference"] < 1e-5
+
+
+def test_a_rare_step_may_round_and_may_not_be_wrong():
+    shapes = {"h": jax.ShapeDtypeStruct((1,), np.float32)}, {"image": jax.ShapeDtypeStruct((16, 16, 3), np.uint8)}
+
+    def network(off):
+        """The third step is off."""
+
+        def step(carry, obs):
+            late = jnp.where(carry["h"] == 2.0, off, 0.0)
+            return {"h": carry["h"] + 1.0}, (jnp.tanh(obs["image"][0, 0, :1] / 510.0) + late,)
+
+        return Network(step, *shapes)
+
+    checked = parity(to_onnx(network(2e-5)), network(0.0), 20)
+    assert checked["median_abs_action_difference"] < 1e-6 and checked["max_abs_action_difference"] > 1e-5
+    with pytest.raises(ValueError, match="0.002 at most"):
+        parity(to_onnx(network(2e-3)), network(0.0), 20)

@@ -169,6 +169,17 @@ def test_an_operator_of_other_libraries_agrees_with_onnxruntime(kind, attributes
 
 
 @pytest.mark.quick
+def test_sums_of_large_exponentials_do_not_overflow():
+    from onnx import TensorProto, helper
+
+    graph = helper.make_graph([helper.make_node("ReduceLogSumExp", ["x"], ["y"], keepdims=0)], "large",
+                              [helper.make_tensor_value_info("x", TensorProto.FLOAT, [2])],
+                              [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)])  # fmt: skip
+    data = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8).SerializeToString()
+    assert Network(data)(np.array([100.0, 101.0], np.float32))[0] == pytest.approx(101.3133, abs=1e-3)
+
+
+@pytest.mark.quick
 def test_damaged_and_foreign_policy_files_are_refused(seeker, tmp_path):
     import shutil
 

@@ -102,6 +102,12 @@ def _reduction(name: str, before: str = "", after: str = "") -> Operator:
     return reduce
 
 
+def _log_sum_exp(xp, attributes, count, values, axes=None):
+    highest = _reduction("max")(xp, {**attributes, "keepdims": 1}, count, values, axes)  # else exp overflows
+    found = _reduction("sum", before="exp", after="log")(xp, attributes, count, values - highest, axes)
+    return found + xp.reshape(highest, found.shape)
+
+
 def _div(xp, attributes, count, a, b):
     if np.issubdtype(a.dtype, np.integer):
         return xp.trunc(a / b).astype(a.dtype) if xp is np else jax.lax.div(*jnp.broadcast_arrays(a, b))
@@ -290,7 +296,7 @@ OPERATORS: dict[str, Operator] = {
     "ReduceL1": _reduction("sum", before="abs"),
     "ReduceL2": _reduction("sum", before="square", after="sqrt"),
     "ReduceLogSum": _reduction("sum", after="log"),
-    "ReduceLogSumExp": _reduction("sum", before="exp", after="log"),
+    "ReduceLogSumExp": _log_sum_exp,
     "ReduceMax": _reduction("max"),
     "ReduceMean": _reduction("mean"),
     "ReduceMin": _reduction("min"),
