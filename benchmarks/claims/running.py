@@ -120,8 +120,8 @@ CLAIMS = (
         "The simulator as a robot, and the loop over topics",
         "bridge",
         "Resets: with images that come late and out of order. Loop: contact plant behind topics, one hidden effect. "
-        "Six of ten draws were finished by the present code. The other four were named by earlier code; in one of them the "
-        "held-out error rose by 94 %.",
+        "Six of ten draws were finished by the present code. The other four were named by earlier code; in one of them "
+        "the held-out error rose by 94 %.",
         ("figure", "value"),
         (
             ("rows recorded at 100 Hz beside two busy processes", "{record_rows_kept|range %}"),
