@@ -332,8 +332,23 @@ def _is_whole(table: Table) -> bool:
 
 
 def _said_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:
-    """The decisions that are of these files."""
-    return [read_decision(text, tables) for text in said if _is_here(text, tables) or len(tables) == 1]
+    """The decisions that are of these files.
+
+    Raises:
+        ValueError: two of them are of one column, or give one role to two.
+    """
+    found: dict[tuple[str, ...], str] = {}
+    columns = []
+    for text in dict.fromkeys(said):
+        if not _is_here(text, tables) and len(tables) > 1:
+            continue
+        one = read_decision(text, tables)
+        columns.append(one)
+        for key in ((one.role, one.file if one.role == "time" else ""), ("", one.file, one.name)):
+            if (other := found.setdefault(key, text)) != text:
+                raise ValueError(f"--columns {other} and {text}: two decisions on one "
+                                 f"{'role' if key[0] else 'column'}. Leave one of them out.")
+    return columns
 
 
 def _decide(
@@ -353,7 +368,7 @@ def _decide(
             print(f"  {one}" + (f"   ({one.why})" if one.why else ""))
         print("Columns:", ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns))
         answer = input("Enter takes this; or type what differs, as ROLE=COLUMN:UNIT ROLE=COLUMN:UNIT ...\n> ")
-        decided += [read_decision(text, tables) for text in answer.split()]
+        decided = _said_of(tables, [*said, *answer.split()])
         columns = [replace(one, why="", sure=True, assumed=False) for one in guessed_now()]
         problem, said = _problem(tables, columns), [str(one) for one in columns]
     if problem:
@@ -446,9 +461,9 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     wheels = _as_twist(_with_rates(streams["wheels"]), columns, "wheels", geometry) if "wheels" in streams else None
     if wheels is not None and "command" in made and (backwards := _backwards(made["command"], wheels)):
         one = next(one for one in columns if one.role.startswith(f"wheels.{backwards}"))
+        turned = replace(one, sign=-one.sign, unit="" if one.why else one.unit)  # a unit guessed from it may be wrong
         raise ValueError(f"{source}: {one.file}/{one.name}: the {backwards} wheel counts backwards: the two differ "
-                         f"where the vehicle is sent straight ahead. Turn its sign: --columns {one.role}={one.file}/"
-                         f"{one.name}:-")
+                         f"where the vehicle is sent straight ahead. Turn its sign: --columns {turned}")
     odometry = streams.get("odometry")
     if odometry is not None:
         made["odometry"], note = _as_odometry(odometry, wheels)

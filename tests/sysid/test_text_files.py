@@ -157,6 +157,33 @@ def test_a_wheel_that_counts_backwards_is_named_and_turned_by_a_flag(tmp_path, s
     check(again.trials[0], pose=False)
 
 
+def test_the_remedy_for_a_backward_encoder_keeps_its_ticks(tmp_path):
+    c = columns()
+    turns = {side: np.concatenate([[0.0], np.cumsum((c["v"] + sign * 0.248 * c["w"])[1:] * np.diff(c["t"]))]) / 0.1325
+             for side, sign in (("left", -1), ("right", 1))}
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"],
+                                          "enc_left": turns["left"] * 1024 / (2 * np.pi),
+                                          "enc_right": -turns["right"] * 1024 / (2 * np.pi)})
+    said = ("wheels.left_angle=enc_left:1024/rev", "wheels.right_angle=enc_right:1024/rev")
+    with pytest.raises(ValueError, match="the right wheel counts backwards") as error:
+        convert(ConvertConfig(path, tmp_path / "log", columns=said))
+    remedy = str(error.value).rpartition(" ")[2]
+    assert remedy == "wheels.right_angle=drive/enc_right:-1024/rev"
+    log, _ = convert(ConvertConfig(path, tmp_path / "log", columns=(said[0], remedy)))
+    np.testing.assert_allclose(log.trials[0].odometry.yaw[-1], DRIVE.odometry.yaw[-1] - DRIVE.odometry.yaw[0], atol=0.1)
+    with pytest.raises(ValueError, match=f"{said[1]} and {remedy}: two decisions on one role"):
+        convert(ConvertConfig(path, tmp_path / "other", columns=(*said, remedy)))
+
+
+def test_two_decisions_on_one_column_are_refused_and_one_said_twice_is_not(tmp_path):
+    c = columns()
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"], "a": c["v"], "b": c["w"]})
+    said = ("odometry.v=a:m/s", "odometry.omega=b:rad/s")
+    convert(ConvertConfig(path, tmp_path / "log", columns=(*said, said[0])))
+    with pytest.raises(ValueError, match="odometry.v=a:m/s and odometry.omega=a:rad/s: two decisions on one column"):
+        convert(ConvertConfig(path, tmp_path / "other", columns=(said[0], "odometry.omega=a:rad/s")))
+
+
 def test_a_file_of_too_few_rows_is_named_where_it_leaves_no_drive(tmp_path):
     c = columns()
     write(tmp_path / "drive" / "odom.csv", {name: c[name] for name in ("t", "x", "y", "yaw", "v", "w")})
