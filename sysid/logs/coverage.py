@@ -13,7 +13,7 @@ from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replica
 from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
-from sysid.logs.time_faults import pauses, set_forward, time_faults, uncommanded
+from sysid.logs.time_faults import forward_jump, pauses, set_forward, time_faults, uncommanded
 from sysid.logs.unusable import LOST, lost, said, stood
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
@@ -131,17 +131,18 @@ def doubts(log: Log) -> list[str]:
 def faults(log: Log, responses: Responses | None = None) -> list[str]:
     """Of what `sanity` says, units, signs, frames and times that are wrong."""
     trials, skid = log.trials, log.spec.drive == "skid"
-    if jumped := set_forward(trials):
-        return jumped
+    if jumped := set_forward(trials):  # these trials show no other fault, and hide none of the others
+        others = tuple(trial for trial in trials if forward_jump(trial) is None)
+        return [*jumped, *(faults(replace(log, trials=others), responses) if others else [])]
     found: list[str] = []
     cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
     for channel in CHANNELS:
         found += [one for one in contradicted[channel] if one not in found]
         seen, reversed_ones, clear = list[str](), list[str](), True
-        shifts = responses[channel] if responses else {trial.name: response_shift(trial, channel) for trial in trials}
+        shifts = [responses[channel][trial.name] if responses else response_shift(trial, channel) for trial in trials]
         for index, (name, unit) in enumerate((("v", "m/s"), ("omega", "rad/s")), start=1):
-            gains = _gains(trials, channel, index, list(shifts.values()))
+            gains = _gains(trials, channel, index, shifts)
             if not gains or cut or contradicted[channel]:  # a wrong frame or clock shows neither sign nor unit
                 continue
             least = 0.1 if skid and name == "omega" else 0.4  # a skid drive scrubs most of its turn

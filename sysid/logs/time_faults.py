@@ -37,7 +37,7 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
 
 
 def set_forward(trials: Sequence[Trial]) -> list[str]:
-    """A sentence on clocks that were set forward in a drive. Nothing else that looks odd then says anything."""
+    """A sentence on clocks that were set forward in a drive. What else looks odd in these trials does not count."""
     jumps = [(trial.name, *jump) for trial in trials if (jump := forward_jump(trial)) is not None]
     paused = [trial for trial in trials if _outage(trial) is not None and forward_jump(trial) is None]
     if len(jumps) <= len(paused):  # in some pauses of a recording the vehicle happens to be slow

@@ -11,6 +11,7 @@ import pytest
 from sysid.logs.coverage import doubts, sanity
 from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
+from sysid.logs.metrics import CHANNELS
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 from sysid.logs.streams import clock_shift, response_shift
 from sysid.logs.unusable import stood, without_standing
@@ -183,12 +184,28 @@ def test_commands_that_come_only_where_they_change_are_no_pause_of_the_recording
     assert not any("recording paused" in one for one in sanity(log_of(replace(trial, command=seldom, **gappy))))
 
 
+def set_forward(trial):
+    """The trial by a clock that is set forward by an hour in it."""
+    streams = {one: getattr(trial, one) for one in ("command", "odometry", "ground_truth")}
+    return replace(trial, **{one: replace(stream, t=stream.t + 3600.0 * (stream.t > 15.0))
+                             for one, stream in streams.items()})
+
+
 def test_of_a_clock_that_was_set_forward_nothing_else_is_said():
-    trial = drive()
-    jumped = {one: replace(stream, t=stream.t + 3600.0 * (stream.t > 15.0)) for one in (
-        "command", "odometry", "ground_truth") if (stream := getattr(trial, one)) is not None}
-    (said,) = sanity(log_of(replace(trial, **jumped)))
+    (said,) = sanity(log_of(set_forward(drive())))
     assert "the clock was set forward" in said
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["responses computed", "responses known"])
+def test_a_clock_that_was_set_forward_in_one_trial_does_not_hide_the_faults_of_others(known):
+    turned = [replace(one, odometry=replace(one.odometry, omega=57.3 * one.odometry.omega))
+              for one in (drive("a"), drive("b", seed=1))]
+    log = log_of(set_forward(drive("c", seed=2)), *turned)
+    responses = {channel: {one.name: response_shift(one, channel) for one in log.trials} for channel in CHANNELS}
+    found = sanity(log, responses if known else None)
+    assert "in 1 of 3 trials (c" in found[0] and "the clock was set forward" in found[0]
+    assert any("odometry" in one and "omega" in one for one in found[1:])
+    assert found[1:] == sanity(log_of(*turned))
 
 
 def test_a_jump_of_the_outside_pose_is_no_motion_of_the_vehicle():
