@@ -62,6 +62,7 @@ OPTIONS = {"command": "--command-topic", "odometry": "--odometry-topic", "ground
 SUFFIXES = (".db3", ".mcap", ".bag")
 PACKED = (".zst", ".zstd")
 UNPACKED_BYTES = 20_000_000_000  # of one packed bag at most
+STATIC = "_static"  # after the name of a topic of transforms: those of it that never change
 DAY, STRAY = 86400.0, 0.01  # s from most messages, and the share of them, up to which a time of receipt is no clock's
 MAX_SET_BACK = 0.5  # s that a stamp may run back by before the clock counts as set
 
@@ -134,10 +135,10 @@ def read_bag(
         store.register(get_types_from_msg(CHAIR_DEFINITION + JOYSTICK_FIELDS, f"whill_msgs/msg/{CHAIR_STATE}"))
         with _opened(AnyReader, path, store, notes) as reader:
             known = {name: str(about.msgtype) for name, about in reader.topics.items() if about.msgcount}
-            framed = _framed(known, topics or {})
-            chosen = choose_topics(path, known, {**(topics or {}), **dict.fromkeys(framed, "")}, notes, wheels)
+            asked = topics or {}
+            chosen = choose_topics(path, known, {**asked, **dict.fromkeys(_framed(known, asked), "")}, notes, wheels)
             rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
-            streams = _of_frames(path, reader, known, framed, _unposed(chosen, topics or {}, wheels), notes)
+            streams = _of_frames(path, reader, known, asked, _unposed(chosen, asked, wheels), notes)
             if not {"odometry", "ground_truth"} & {*chosen, *streams}:
                 raise _no_pose(path, known)
             notes += [] if "ground_truth" in {*chosen, *streams} else _not_read(known, "odometry" in chosen)
@@ -147,7 +148,7 @@ def read_bag(
         raise ValueError(f"{path}: cannot be read as a ROS bag ({str(error)[:LONGEST_REASON]}). Give the folder with "
                          "metadata.yaml, or a .db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` or "
                          "`mcap recover` repairs one.") from None
-    spare = {"imu"} if (topics or {}).get("imu") is None else set()  # found by itself, and nothing depends on it
+    spare = {"imu"} if asked.get("imu") is None else set()  # found by itself, and nothing depends on it
     for stream, topic in chosen.items():
         kept = _usable(path, stream, topic, short_type(known[topic]), rows[stream], notes)
         if len(kept) >= 2:
@@ -181,10 +182,20 @@ def _opened(reader: Any, path: Path, store: Any, notes: list[str]) -> Iterator[A
         opened.close()
 
 
-def _framed(known: Mapping[str, str], asked: Mapping[str, str]) -> dict[str, str]:
-    """Stream -> "" or "PARENT:CHILD" of those for which transforms were named, as /tf or /tf:PARENT:CHILD."""
-    return {stream: topic.partition(":")[2] for stream, topic in asked.items() if stream in ("odometry", "ground_truth")
-            and short_type(known.get(topic.partition(":")[0], "")) in transforms.KINDS}
+def _framed(known: Mapping[str, str], asked: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Stream -> topic, and "" or "PARENT:CHILD", where transforms were named, as /tf or /tf:PARENT:CHILD."""
+    split = {stream: asked[stream].partition(":") for stream in ("odometry", "ground_truth") if stream in asked}
+    return {stream: (topic, frames) for stream, (topic, _, frames) in split.items()
+            if short_type(known.get(topic, "")) in transforms.KINDS}
+
+
+def _namespaces(known: Mapping[str, str]) -> list[tuple[str, ...]]:
+    """The topics of transforms that belong together: those that move, then the static ones beside them, if any."""
+    topics = sorted((topic for topic, kind in known.items() if short_type(kind) in transforms.KINDS),
+                    key=lambda topic: (len(topic), topic))  # /tf first
+    moving = [topic for topic in topics if not topic.endswith(STATIC)]
+    found = [(topic, *[one for one in (topic + STATIC, f"/tf{STATIC}") if one in topics][:1]) for topic in moving]
+    return found + [(topic,) for topic in topics if not any(topic in one for one in found)]
 
 
 def _unposed(chosen: Mapping[str, str], asked: Mapping[str, str], wheels: bool) -> list[str]:
@@ -196,28 +207,35 @@ def _unposed(chosen: Mapping[str, str], asked: Mapping[str, str], wheels: bool) 
 
 
 def _of_frames(
-    path: Path, reader: Any, known: Mapping[str, str], framed: dict[str, str], wanted: list[str], notes: list[str]
+    path: Path, reader: Any, known: Mapping[str, str], asked: Mapping[str, str], wanted: list[str], notes: list[str]
 ) -> dict[str, BagStream]:
     """Streams out of transforms: those that were named, or the one that there is of those that are wanted."""
-    topics = [topic for topic, kind in known.items() if short_type(kind) in transforms.KINDS]
-    if not topics or not framed and not wanted:
+    framed, trees = _framed(known, asked), _namespaces(known)
+    if framed:
+        trees = [one for one in trees if any(topic in one for topic, _ in framed.values())]
+    if not trees or not framed and not wanted:
         return {}
-    links, broken = transforms.Links(), 0
+    links, broken = {one: transforms.Links(one) for one in trees}, Counter[str]()
+    topics = {topic for one in trees for topic in one}
     for connection, received, raw in reader.messages(connections=[one for one in reader.connections
                                                                   if one.topic in topics]):
         try:
-            links.add(received * 1e-9, reader.deserialize(raw, connection.msgtype))
+            message = reader.deserialize(raw, connection.msgtype)
+            for one in trees:
+                if connection.topic in one:
+                    links[one].add(received * 1e-9, message)
         except Exception:  # as of any damaged message
-            broken += 1
-    if broken:
-        notes.append(f"{', '.join(topics)}: {broken} damaged messages are left out")
+            broken[connection.topic] += 1
+    notes += [f"{topic}: {count} damaged messages are left out" for topic, count in broken.items()]
     try:
-        found = transforms.chosen_poses(links, framed, wanted, notes)
+        found = transforms.chosen_poses(list(links.values()), framed, wanted, notes)
     except transforms.NoChain as error:
         option = OPTIONS[next(iter(framed), wanted[0] if wanted else "ground_truth")]
-        raise ValueError(f"{path}: {', '.join(topics)}: {error}. Name the frames, {option} {topics[0]}:PARENT:CHILD; "
-                         "or record the pose as Odometry or PoseStamped.") from None
-    return {stream: BagStream(f"{topics[0]}:{one.parent}:{one.child}", known[topics[0]], one.received, one.stamped,
+        topic = next((topic for topic, _ in framed.values()), trees[0][0])
+        said = (f"{', '.join(sorted(topics))}: {error}. Name the frames, {option} {topic}:PARENT:CHILD; or record the "
+                "pose as Odometry or PoseStamped.")
+        raise ValueError(f"{path}: {said}") from None
+    return {stream: BagStream(f"{one.topic}:{one.parent}:{one.child}", known[one.topic], one.received, one.stamped,
                               one.with_speeds() if stream == "odometry" else one.pose)
             for stream, one in found.items()}
 
@@ -239,7 +257,7 @@ def _not_read(known: Mapping[str, str], frames: bool = False) -> list[str]:
         frames: transforms are none of the streams, though they might be the outside pose.
     """
     kinds = {short_type(kind): topic for topic, kind in known.items()}
-    held = [topic for kind, topic in kinds.items() if frames and kind in transforms.KINDS]
+    held = [topics[0] for topics in _namespaces(known) if frames]
     return [*(f"{kinds[kind]} is {kind}, {why}" for kind, why in NOT_READ.items() if kind in kinds),
             *(f"{topic} holds frames, which are not looked at: --truth-topic {topic} takes the pose in map or world "
               "from them, if it measures the vehicle from outside" for topic in held[:1])]

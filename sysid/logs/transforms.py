@@ -7,8 +7,9 @@ against their direction, as where a lidar odometry publishes `odom` as a child o
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,10 @@ class NoChain(ValueError):
 
 @dataclass
 class Links:
-    """Every transform of a recording: (parent, child) -> rows of receipt, stamp [s], x, y, z [m], qx, qy, qz, qw."""
+    """The transforms of one namespace: (parent, child) -> rows of receipt, stamp [s], x, y, z [m], qx, qy, qz, qw."""
 
+    topics: tuple[str, ...] = ("/tf", "/tf_static")
+    """Topics that they come from; options name the first."""
     rows: dict[tuple[str, str], list[tuple[float, ...]]] = field(default_factory=dict)
     unset: int = 0
     """Transforms that are left out, whose numbers are not finite or whose quaternion is zero."""
@@ -55,7 +58,7 @@ class Links:
 
     def __str__(self) -> str:
         """The links, as errors show them."""
-        listed = [f"{shown(parent)} to {shown(child)}" for parent, child in self.rows]
+        listed = list(map(_arrow, self.rows))
         return ", ".join(listed[:LISTED]) + (f" and {len(listed) - LISTED} more" if len(listed) > LISTED else "")
 
 
@@ -63,6 +66,8 @@ class Links:
 class Chained:
     """Pose of one frame in another."""
 
+    topic: str
+    """The topic of its transforms."""
     parent: str
     child: str
     received: np.ndarray  # (T,) s
@@ -116,6 +121,11 @@ def outside_frame(links: Links, base: str) -> str | None:
     return roots[0] if roots and any(_moves(links.rows[key]) for key, _ in chain(links, roots[0], base) or ()) else None
 
 
+FRAME_OF = {"odometry": odometry_frame, "ground_truth": outside_frame}
+"""Stream -> the frame in which its poses are."""
+USUAL = {"odometry": "odom", "ground_truth": "map or world"}
+
+
 def chain(links: Links, parent: str, child: str) -> list[tuple[tuple[str, str], bool]] | None:
     """The links from `parent` to `child`, the fewest, and whether each is used along its direction; None without."""
     came: dict[str, tuple[str, tuple[str, str], bool]] = {}
@@ -135,7 +145,7 @@ def chain(links: Links, parent: str, child: str) -> list[tuple[tuple[str, str], 
     return found[::-1]
 
 
-def pose_of(links: Links, parent: str, child: str) -> Chained:
+def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
     """The pose of a frame in another, each time that the link which moves most often was sent.
 
     Other moving links are interpolated to these times, as tf2 does. Before one of them was first sent there is no pose.
@@ -152,61 +162,89 @@ def pose_of(links: Links, parent: str, child: str) -> Chained:
     if len(clock) < 2:
         raise NoChain(f"{shown(child)} in {shown(parent)} was sent once: it never moves (frames: {links})")
     by_stamp = all((tables[key][:, 1] > 0).all() for key in moving)
+    times = {key: table[:, 1 if by_stamp else 0] for key, table in tables.items()}
     t = clock[:, 1 if by_stamp else 0]
-    first = max((tables[key][0, 1 if by_stamp else 0] for key in moving), default=t[0])
-    kept = t >= first - 1e-6
+    kept = t >= max((times[key][0] for key in moving), default=t[0]) - 1e-6
     place, turn = np.zeros((kept.sum(), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (kept.sum(), 1))
     for key, along in found:
-        table = tables[key] if key in moving else tables[key][:1]
-        moved, turned = _at(table[:, 1 if by_stamp else 0], table[:, 2:], t[kept])
+        rows = slice(None) if key in moving else slice(1)
+        moved, turned = _at(times[key][rows], tables[key][rows, 2:], t[kept])
         if not along:
             turned = turned * [-1.0, -1.0, -1.0, 1.0]
             moved = -_rotated(turned, moved)
         place, turn = place + _rotated(turn, moved), _product(turn, turned)
     x, y, z, w = turn.T
     yaw = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-    return Chained(parent, child, clock[kept, 0], clock[kept, 1], np.column_stack([place[:, :2], yaw]))
+    return Chained(links.topics[0], parent, child, clock[kept, 0], clock[kept, 1], np.column_stack([place[:, :2], yaw]))
 
 
-def chosen_poses(links: Links, asked: dict[str, str], wanted: Iterable[str], notes: list[str]) -> dict[str, Chained]:
+def chosen_poses(
+    trees: Sequence[Links], asked: Mapping[str, tuple[str, str]], wanted: Iterable[str], notes: list[str]
+) -> dict[str, Chained]:
     """The poses that stand for streams.
 
     Args:
-        asked: stream -> "" or "PARENT:CHILD", as the caller named it.
+        trees: the links of each namespace; robots in namespaces may give the same names to their frames.
+        asked: stream -> topic, and "" or "PARENT:CHILD", as the caller named them.
         wanted: further streams, of which the one that there is may be taken.
         notes: what was chosen is added.
 
     Raises:
         NoChain: naming the frames.
     """
-    if links.unset:
-        notes.append(f"{links.unset} transforms whose numbers are not finite, or with an orientation that is all zero, "
+    if unset := sum(links.unset for links in trees):
+        notes.append(f"{unset} transforms whose numbers are not finite, or with an orientation that is all zero, "
                      "are left out")
     found = {}
-    for stream, frames in asked.items():
+    for stream, (topic, frames) in asked.items():
+        links = next(one for one in trees if topic in one.topics)
         parent, _, child = frames.partition(":")
         child = child.strip("/") or base_frame(links)
-        named = parent.strip("/") or (odometry_frame if stream == "odometry" else outside_frame)(links, child)
+        named = parent.strip("/") or FRAME_OF[stream](links, child)
         if named is None:
             raise NoChain(f"no frame of the {'odometry' if stream == 'odometry' else 'room'} leads to {shown(child)} "
                           f"(frames: {links})")
-        found[stream] = pose_of(links, named, child)
+        found[stream] = pose_of(links, named, child, notes)
     wanted = [stream for stream in wanted if stream not in found]
     if not found and wanted:
-        base = base_frame(links)
-        odometry, outside = odometry_frame(links, base), outside_frame(links, base)
-        if "odometry" in wanted and odometry is not None:
-            found["odometry"] = pose_of(links, odometry, base)
-            if "ground_truth" in wanted and outside is not None:
-                notes.append(f"no outside pose is taken. {shown(base)} in {shown(outside)} may be one: --truth-topic "
-                             f"/tf:{outside}:{base}, if it measures the vehicle from outside")
-        elif "ground_truth" in wanted and outside is not None:
-            found["ground_truth"] = pose_of(links, outside, base)
-        else:
-            raise NoChain(f"no links lead from odom, map or world to {shown(base)} (frames: {links})")
+        found = _only_pose(trees, wanted, notes)
     for stream, one in found.items():
         more = f"; v and omega are its differences over {DIFFERENCED:g} s" if stream == "odometry" else ""
-        notes.append(f"{stream} is {shown(one.child)} in {shown(one.parent)}, of the transforms{more}")
+        notes.append(f"{stream} is {shown(one.child)} in {shown(one.parent)}, of the transforms of {one.topic}{more}")
+    return found
+
+
+def _only_pose(trees: Sequence[Links], wanted: Sequence[str], notes: list[str]) -> dict[str, Chained]:
+    """The pose that nobody named: the odometry, else the outside pose, of the one namespace that has it."""
+    for one, other in combinations(trees, 2):
+        if both := [key for key in one.rows if _moves(one.rows[key]) and _moves(other.rows.get(key, ()))]:
+            raise NoChain(f"{one.topics[0]} and {other.topics[0]} both have {_arrow(both[0])}: they may be two robots")
+    offers: dict[str, list[tuple[Links, str, str]]] = {stream: [] for stream in FRAME_OF}
+    refused = []
+    for links in trees:
+        try:
+            base = base_frame(links)
+        except NoChain as error:
+            refused.append(error)
+            continue
+        able = [(stream, frame) for stream, find in FRAME_OF.items()
+                if stream in wanted and (frame := find(links, base)) is not None]
+        for stream, frame in able:
+            offers[stream].append((links, frame, base))
+        if not able:
+            parents = ", ".join(USUAL[stream] for stream in FRAME_OF if stream in wanted)
+            refused.insert(0, NoChain(f"no links lead from {parents} to {shown(base)} (frames: {links})"))
+    if not any(offers.values()):
+        raise refused[0]
+    stream = next(one for one in offers if offers[one])
+    if len(offers[stream]) > 1:
+        named = " and ".join(links.topics[0] for links, _, _ in offers[stream])
+        raise NoChain(f"{named} each have the pose of a vehicle")
+    found = {stream: pose_of(*offers[stream][0], notes)}
+    if stream == "odometry":
+        for links, outside, base in offers["ground_truth"][:1]:
+            notes.append(f"no outside pose is taken. {shown(base)} in {shown(outside)} may be one: --truth-topic "
+                         f"{links.topics[0]}:{outside}:{base}, if it measures the vehicle from outside")
     return found
 
 
@@ -216,6 +254,11 @@ def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) ->
     low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
     dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
     return (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
+
+
+def _arrow(link: tuple[str, str]) -> str:
+    """A link, as messages name it."""
+    return f"{shown(link[0])} to {shown(link[1])}"
 
 
 def _last(frame: str) -> str:

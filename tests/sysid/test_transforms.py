@@ -28,20 +28,23 @@ def inverse(x, y, yaw):
     return -np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x - np.cos(yaw) * y, -yaw
 
 
-def bag_of_frames(folder, links, keep=(), storage=StoragePlugin.SQLITE3):
+def bag_of_frames(folder, links, keep=(), storage=StoragePlugin.SQLITE3, **named):
     """A recording with the commands of `motion`, topics to keep, and rows of transforms at 20 Hz: each a function of
     the time, the pose, which gives (parent, child, x, y, yaw) or None, and static ones of (parent, child, x, y, yaw).
+
+    `links` are those of /tf, or by the topic of each namespace; `named` goes to `write_bag`.
     """
     def edit(rows):
         made = [row for row in rows if row[1] in (COMMAND, *keep)]
-        for k, t in enumerate(np.arange(0.01, 21.0, 0.05)):
-            for one in links:
-                if callable(one) and (found := one(k, t, *motion(t)[2:])) is not None:
-                    made.append((t + 0.02, "/tf", KIND, link(t, *found)))
-        made += [(0.0, "/tf_static", KIND, link(0.0, *one)) for one in links if not callable(one)]
+        for topic, ones in (links if isinstance(links, dict) else {"/tf": links}).items():
+            for k, t in enumerate(np.arange(0.01, 21.0, 0.05)):
+                for one in ones:
+                    if callable(one) and (found := one(k, t, *motion(t)[2:])) is not None:
+                        made.append((t + 0.02, topic, KIND, link(t, *found)))
+            made += [(0.0, f"{topic}_static", KIND, link(0.0, *one)) for one in ones if not callable(one)]
         return sorted(made, key=lambda row: row[0])
 
-    return write_bag(folder, storage, edit=edit)
+    return write_bag(folder, storage, edit=edit, **named)
 
 
 def odom(k, t, x, y, yaw, parent="odom", child="base_footprint"):
@@ -149,3 +152,48 @@ def test_wheel_speeds_and_a_tracked_body_need_no_commands(tmp_path):
     bag = write_bag(tmp_path / "drive", edit=edit)
     log, _ = convert(ConvertConfig(bag, tmp_path / "data", wheel_radius=0.1, track=0.4))
     assert log.fields["input"] == "wheels" and log.trials[0].ground_truth is not None
+
+
+def beside(k, t, x, y, yaw):
+    """Another robot, which turns the other way, and whose frames have the same names."""
+    return "odom", "base_footprint", x, -y, -yaw
+
+
+@pytest.mark.parametrize(("topic", "sign"), [("/left/tf", 1.0), ("/right/tf", -1.0)])
+def test_of_two_robots_in_namespaces_the_named_one_is_read(tmp_path, topic, sign):
+    bag = bag_of_frames(tmp_path / "drive", {"/left/tf": [odom], "/right/tf": [beside]})
+    log, notes = convert(ConvertConfig(bag, tmp_path / "data", odometry_topic=topic))
+    (trial,) = log.trials
+    np.testing.assert_allclose(trial.odometry.y, sign * motion(trial.odometry.t - 0.01)[3], atol=1e-2)
+    assert any(f"of the transforms of {topic}" in note for note in notes)
+
+
+@pytest.mark.parametrize(("right", "said"), [
+    (beside, "/left/tf and /right/tf both have 'odom' to 'base_footprint': they may be two robots"),
+    (lambda *a: odom(*a, child="base_link"), "/left/tf and /right/tf each have the pose of a vehicle"),
+], ids=["same names", "other names"])  # fmt: skip
+def test_two_robots_in_namespaces_of_which_none_is_named_are_refused_by_their_topics(tmp_path, right, said):
+    bag = bag_of_frames(tmp_path / "drive", {"/left/tf": [odom], "/right/tf": [right]})
+    with pytest.raises(ValueError, match=f"{said}.*--odometry-topic /left/tf:PARENT:CHILD"):
+        convert(ConvertConfig(bag, tmp_path / "data"))
+
+
+def test_a_namespace_goes_with_its_own_static_transforms_or_with_those_of_all(tmp_path):
+    links = {"/left/tf": [odom, ("base_footprint", "seat", 0.5, 0, 0)], "/right/tf": [beside],
+             "/tf": [("base_footprint", "seat", 0.2, 0, 0)]}
+    bag = bag_of_frames(tmp_path / "drive", links)
+    for topic, ahead in (("/left/tf", 0.5), ("/right/tf", 0.2)):
+        name = f"{topic}:odom:seat"
+        log, _ = convert(ConvertConfig(bag, tmp_path / topic[1:], odometry_topic=name))
+        x, _, yaw = motion(log.trials[0].odometry.t - 0.01)[2:]
+        np.testing.assert_allclose(log.trials[0].odometry.x, x + ahead * (np.cos(yaw) - 1), atol=3e-2)
+
+
+def test_the_remedy_names_the_topic_that_the_bag_has_and_works(tmp_path):
+    bag = bag_of_frames(tmp_path / "drive", {"/left/tf": [odom, corrected, ("base_footprint", "base_link", 0, 0, 0)]})
+    _, notes = convert(ConvertConfig(bag, tmp_path / "data"))
+    (said,) = [note for note in notes if "no outside pose is taken" in note]
+    remedy = said.partition("--truth-topic ")[2].partition(",")[0]
+    assert remedy == "/left/tf:map:base_footprint"
+    log, _ = convert(ConvertConfig(bag, tmp_path / "again", truth_topic=remedy))
+    assert log.trials[0].ground_truth is not None
