@@ -24,6 +24,7 @@ FIXED = ("map", "world", "earth", "mocap", "vicon", "optitrack", "qualisys", "gl
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 STANDING = 1e-6  # m, and of a quaternion, that a link may change by and not count as moving
 LISTED = 12  # links that an error names
+HELD = (1.0, 5.0)  # s and usual intervals of a link: the longest time after its end for which it is held without a note
 
 
 class NoChain(ValueError):
@@ -149,9 +150,10 @@ def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
     """The pose of a frame in another, each time that the link which moves most often was sent.
 
     Other moving links are interpolated to these times, as tf2 does. Before one of them was first sent there is no pose.
+    After its last row a link is held; a note says so where that is long.
 
     Raises:
-        NoChain: no links connect them, or none of these moves.
+        NoChain: no links connect them, none of these moves, or they share no time.
     """
     found = chain(links, parent, child)
     if found is None:
@@ -165,6 +167,16 @@ def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
     times = {key: table[:, 1 if by_stamp else 0] for key, table in tables.items()}
     t = clock[:, 1 if by_stamp else 0]
     kept = t >= max((times[key][0] for key in moving), default=t[0]) - 1e-6
+    if kept.sum() < 2:
+        begin = min(times[key][0] for key in moving)
+        spans = ", ".join(f"{_arrow(key)} from {times[key][0] - begin:.1f} to {times[key][-1] - begin:.1f} s"
+                          for key in moving)
+        raise NoChain(f"the links from {shown(parent)} to {shown(child)} share no time: {spans}")
+    for key in moving:
+        held = float(t[-1] - times[key][-1])
+        if held > max(HELD[0], HELD[1] * float(np.median(np.diff(times[key])))):
+            notes.append(f"{links.topics[0]}: {_arrow(key)} was last sent {held:.1f} s before the end and is held from "
+                         "there on. Cut the recording there if it should have moved")
     place, turn = np.zeros((kept.sum(), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (kept.sum(), 1))
     for key, along in found:
         rows = slice(None) if key in moving else slice(1)

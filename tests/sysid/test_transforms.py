@@ -159,6 +159,11 @@ def beside(k, t, x, y, yaw):
     return "odom", "base_footprint", x, -y, -yaw
 
 
+def seconds(one, begin, end):
+    """A link that is sent only for a while."""
+    return lambda k, t, *pose: one(k, t, *pose) if begin <= t < end else None
+
+
 @pytest.mark.parametrize(("topic", "sign"), [("/left/tf", 1.0), ("/right/tf", -1.0)])
 def test_of_two_robots_in_namespaces_the_named_one_is_read(tmp_path, topic, sign):
     bag = bag_of_frames(tmp_path / "drive", {"/left/tf": [odom], "/right/tf": [beside]})
@@ -197,3 +202,23 @@ def test_the_remedy_names_the_topic_that_the_bag_has_and_works(tmp_path):
     assert remedy == "/left/tf:map:base_footprint"
     log, _ = convert(ConvertConfig(bag, tmp_path / "again", truth_topic=remedy))
     assert log.trials[0].ground_truth is not None
+
+
+def drifting(k, t, *pose):
+    """A localisation at 2 Hz that corrects the odometry."""
+    return ("map", "odom", 0.01 * t, 0.0, 0.0) if k % 10 == 0 else None
+
+
+def test_links_that_share_no_time_are_refused_with_their_spans(tmp_path):
+    bag = bag_of_frames(tmp_path / "drive", [seconds(odom, 0, 8), seconds(drifting, 12, 30)])
+    spans = "share no time: 'map' to 'odom' from 12.0 to 20.5 s, 'odom' to 'base_footprint' from 0.0 to 8.0 s"
+    with pytest.raises(ValueError, match=spans):
+        convert(ConvertConfig(bag, tmp_path / "data", truth_topic="/tf"))
+
+
+@pytest.mark.parametrize(("end", "held"), [(6.0, True), (30.0, False)])
+def test_a_link_that_is_held_long_after_its_end_is_noted(tmp_path, end, held):
+    bag = bag_of_frames(tmp_path / "drive", [odom, seconds(drifting, 0, end)])
+    _, notes = convert(ConvertConfig(bag, tmp_path / "data", truth_topic="/tf"))
+    said = "'map' to 'odom' was last sent 15.5 s before the end and is held from there on"
+    assert [said in note for note in notes if "held from there on" in note] == [True] * held
