@@ -140,7 +140,7 @@ def read_bag(
             rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
             streams = _of_frames(path, reader, known, asked, _unposed(chosen, asked, wheels), notes)
             if not {"odometry", "ground_truth"} & {*chosen, *streams}:
-                raise _no_pose(path, known)
+                raise _no_pose(path, known, asked)
             notes += [] if "ground_truth" in {*chosen, *streams} else _not_read(known, "odometry" in chosen)
     except Exception as error:  # the library lets out whatever a damaged recording leads to
         if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
@@ -234,16 +234,21 @@ def _of_frames(
         topic = next((topic for topic, _ in framed.values()), trees[0][0])
         said = (f"{', '.join(sorted(topics))}: {error}. Name the frames, {option} {topic}:PARENT:CHILD; or record the "
                 "pose as Odometry or PoseStamped.")
-        raise ValueError(f"{path}: {said}") from None
+        raise ValueError(f"{path}: {said}") if framed else _no_pose(path, known, asked, said) from None
     return {stream: BagStream(f"{one.topic}:{one.parent}:{one.child}", known[one.topic], one.received, one.stamped,
                               one.with_speeds() if stream == "odometry" else one.pose)
             for stream, one in found.items()}
 
 
-def _no_pose(path: Path, known: dict[str, str]) -> ValueError:
-    more = "".join(f" {one}." for one in _not_read(known))
+def _no_pose(path: Path, known: Mapping[str, str], asked: Mapping[str, str], frames: str = "") -> ValueError:
+    """The error where nothing measures the motion; `frames`: why the transforms give no pose."""
+    poses = [] if asked.get("ground_truth") == "" else [
+        name for name, kind in sorted(known.items()) if short_type(kind) in TYPES["ground_truth"]]
+    more = [*_not_read(known), *([f"{', '.join(poses)} may be the outside pose: {OPTIONS['ground_truth']} {poses[0]}"]
+                                 if poses else [])]
     return ValueError(f"{path}: neither odometry nor outside pose found (topics with messages: {_listing(known)})."
-                      f"{more} Name one with --odometry-topic or --truth-topic.")
+                      f"{''.join(f' {one}.' for one in more)} Name one with --odometry-topic or --truth-topic."
+                      f"{' ' + frames if frames else ''}")
 
 
 def _listing(known: Mapping[str, str]) -> str:

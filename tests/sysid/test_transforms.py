@@ -222,3 +222,19 @@ def test_a_link_that_is_held_long_after_its_end_is_noted(tmp_path, end, held):
     _, notes = convert(ConvertConfig(bag, tmp_path / "data", truth_topic="/tf"))
     said = "'map' to 'odom' was last sent 15.5 s before the end and is held from there on"
     assert [said in note for note in notes if "held from there on" in note] == [True] * held
+
+
+def test_a_pose_beside_frames_without_a_chain_is_named_first_and_can_be_taken(tmp_path):
+    def camera(k, t, *pose):
+        return "camera_link", "camera_optical", 0.0, 0.0, 0.0
+
+    topic = "/vrpn/robot/pose"
+    bag = bag_of_frames(tmp_path / "drive", [camera], [topic], topics=(COMMAND, ODOMETRY, topic),
+                        truth_kind="geometry_msgs/msg/PoseStamped")
+    with pytest.raises(ValueError, match=f"topics with messages: .*{topic} .PoseStamped.*--truth-topic {topic}.*"
+                                         "no frame is called base_footprint"):
+        convert(ConvertConfig(bag, tmp_path / "data"))
+    log, _ = convert(ConvertConfig(bag, tmp_path / "data", truth_topic=topic))
+    assert log.trials[0].ground_truth is not None
+    with pytest.raises(ValueError, match="^[^:]*: /tf: no links lead from 'map' to 'base_link'"):
+        convert(ConvertConfig(bag, tmp_path / "other", truth_topic="/tf:map:base_link"))
