@@ -196,9 +196,15 @@ def leave_out_contacts(path: Path, spec: Any, host: mujoco.MjModel) -> tuple[str
 
 
 def _under(host: mujoco.MjModel, ground: int, bodies: Sequence[int]) -> bool:
-    """Whether a geom of the world reaches under a robot of these bodies where it starts."""
+    """Whether the vertical line through a robot's start meets the box around a geom of the world.
+
+    The axes of a mesh are those of its inertia, of which any may be the vertical one.
+    """
     data = mujoco.MjData(host)
     mujoco.mj_kinematics(host, data)
     root = max(int(host.body_rootid[body]) for body in bodies)
-    place = (data.xpos[root] - data.geom_xpos[ground]) @ data.geom_xmat[ground].reshape(3, 3)
-    return bool((np.abs(place - host.geom_aabb[ground, :3])[:2] < host.geom_aabb[ground, 3:5]).all())
+    turn, middle, half = data.geom_xmat[ground].reshape(3, 3), host.geom_aabb[ground, :3], host.geom_aabb[ground, 3:]
+    place, up = (data.xpos[root] - data.geom_xpos[ground]) @ turn - middle, turn[2]
+    up = np.where(np.abs(up) < 1e-9, 1e-9, up)
+    ends = np.sort(np.stack([-half - place, half - place]) / up, axis=0)  # heights at which it enters and leaves
+    return bool(ends[0].max() < ends[1].min())

@@ -293,9 +293,9 @@ def test_contacts_that_mjx_lacks_between_parts_of_a_robot_are_left_out_with_a_no
 @pytest.mark.quick
 def test_a_contact_with_the_room_that_mjx_lacks_is_one_line_with_both_geoms(tmp_path):
     path = tmp_path / "robot.xml"
-    path.write_text(ROBOT.replace('<body name="base"', '<geom name="pillar" type="cylinder" size="0.1 1" pos="3 0 1"/>'
+    path.write_text(ROBOT.replace('<body name="base"', '<geom name="slab" type="cylinder" size="3 1" pos="0 0 -1"/>'
                                   '<body name="base"').replace('contype="0" conaffinity="0"', ''))
-    with pytest.raises(ValueError, match=r"no contact between geom 'pillar' .cylinder. and geom 'box' .box.. Replace"):
+    with pytest.raises(ValueError, match=r"no contact between geom 'slab' .cylinder. and geom 'box' .box.. Replace"):
         load_robot(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import subprocess
@@ -570,6 +571,20 @@ def test_what_stands_or_rolls_aside_carries_nothing_and_hinders_nothing(tmp_path
     assert "the obstacle's contacts are left out" in " ".join(robot.notes) and "toy" not in check.loads and straight
     with pytest.raises(ValueError, match="MJX has no contact between"):
         load_robot(car_file(tmp_path, SERVOS, '<geom type="cylinder" size="2 0.01" pos="0 0 -0.01"/>'))
+
+
+@pytest.mark.parametrize("turn", ["0 0 0", "0 0 30", "90 0 0"])
+def test_a_mesh_is_a_floor_where_the_robot_stands_on_it_and_an_obstacle_elsewhere(tmp_path, turn):
+    """MuJoCo turns a mesh into its principal axes, so that its first axis may be the vertical one."""
+    sides = (6, 0.1, 5) if turn == "90 0 0" else (6, 5, 0.1)
+    corners = " ".join(f"{a * side / 2}" for signs in itertools.product((-1, 1), repeat=3)
+                       for a, side in zip(signs, sides, strict=True))
+    mesh = f'<asset><mesh name="slab" vertex="{corners}"/></asset>'
+    slab = f'<geom name="slab" type="mesh" mesh="slab" pos="2 1 -0.05" euler="{turn}"/>'
+    with pytest.raises(ValueError, match=r"MJX has no contact between .* and geom 'slab' .mesh."):
+        load_robot(car_file(tmp_path, SERVOS, slab, mesh))
+    aside = load_robot(car_file(tmp_path, SERVOS, slab.replace("2 1 -0.05", "5 1 -0.05"), mesh))
+    assert "the obstacle's contacts are left out" in " ".join(aside.notes)
 
 
 def test_what_drags_on_the_floor_is_named_with_its_friction(tmp_path):
