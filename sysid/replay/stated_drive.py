@@ -36,7 +36,7 @@ def stated_drive(top: ElementTree.Element) -> StatedDrive:
     steering = sideways = ""
     for plugin in top.iter("plugin"):
         name = f"{plugin.get('filename', '')} {plugin.get('name', '')}"
-        if STEERS.search(re.sub(r"skid[_-]?steer", "", name, flags=re.I)):
+        if STEERS.search(re.sub(r"skid[_-]?steer", "", plugin.get("filename", ""), flags=re.I)):  # names are free
             steering = steering or _short(plugin)
             continue
         if SIDEWAYS.search(name):

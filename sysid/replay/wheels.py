@@ -43,8 +43,9 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDri
         return (found[0], found[1]) if len(found) == 2 else _paired(path, spec, found)
     standing = _standing(spec, hinges)
     if standing is not None:
-        _refuse_steering(path, hinges, standing, stated)
-        if (found_sides := _stated_wheels(standing, stated)) is not None:
+        sides_of_plugin = _plugin_wheels(path, standing, stated)
+        _refuse_steering(path, hinges, standing, "" if sides_of_plugin else stated.steering)
+        if (found_sides := sides_of_plugin or _stated_wheels(standing, stated)) is not None:
             return found_sides
     pulled = [name for name in hinges if name in driven.values()]
     for among in (pulled, list(hinges)):
@@ -78,8 +79,9 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDri
 
 
 def as_plain_wheels(path: Path, spec: Any, joints: Sequence[str], stated: StatedDrive) -> list[str]:
-    """Let driven wheels turn without an end; notes on ends that are left out, and on wheels that are no plain ones."""
-    notes, odd = [], []
+    """Let driven wheels turn without an end; notes on ends that are left out, on wheels that are no plain ones, and on
+    what the file says of its drive that is of no use."""
+    notes, odd = _unused(path, spec, joints, stated), []
     for joint in [one for one in spec.joints if one.name in joints]:
         if _has_end(joint):
             low, high = joint.range
@@ -98,6 +100,19 @@ def as_plain_wheels(path: Path, spec: Any, joints: Sequence[str], stated: Stated
         notes.append(f"{path.name}: {', '.join(odd)}{plugin}: mecanum or omni wheels are taken for plain ones. The "
                      "model does not drive sideways, and turns as a skid-steered robot; fit drives without sideways "
                      "commands")
+    return notes
+
+
+def _unused(path: Path, spec: Any, joints: Sequence[str], stated: StatedDrive) -> list[str]:
+    """Notes on joints that the file says are driven, where others were taken."""
+    notes, taken = [], f"the driven wheels are taken to be {', '.join(joints)}"
+    if len(stated.left) != len(stated.right):
+        sides = " and ".join(f"{', '.join(side) or 'no joint'} on the {name}"
+                             for name, side in (("left", stated.left), ("right", stated.right)))
+        notes.append(f"{path.name}: a plugin drives {sides}, which are no pairs: {taken}")
+    absent = [name for name in stated.by_speed if name not in {joint.name for joint in spec.joints}]
+    if absent and not set(stated.by_speed) & set(joints):
+        notes.append(f"{path.name}: a controller drives {', '.join(absent)}, which the file lacks: {taken}")
     return notes
 
 
@@ -137,18 +152,30 @@ def _standing(spec: Any, hinges: Mapping[str, Any]) -> dict[str, _Stand] | None:
     return found
 
 
+def _plugin_wheels(path: Path, standing: Mapping[str, _Stand], stated: StatedDrive) -> tuple[str, ...] | None:
+    """Joints that a plugin drives, in order; None where it names none, or not as many on each side."""
+    remedy = "Correct the plugin, or name the wheels that drive with --wheels."
+    for name in (*stated.left, *stated.right):
+        if name not in standing:
+            raise ValueError(f"{path}: a plugin drives joint {name}, which is no joint of the file that turns "
+                             f"({', '.join(standing)}). {remedy}")
+        if name in stated.left and name in stated.right:
+            raise ValueError(f"{path}: a plugin drives joint {name} on both sides. {remedy}")
+    if not stated.left or len(stated.left) != len(stated.right):
+        return None
+    return tuple(name for side in (stated.left, stated.right)
+                 for name in sorted(side, key=lambda one: -standing[one].place[0]))
+
+
 def _stated_wheels(standing: Mapping[str, _Stand], stated: StatedDrive) -> tuple[str, ...] | None:
-    """Joints that the file says are driven, in order; None where it names none, or others than wheels in pairs."""
-    if stated.left and len(stated.left) == len(stated.right) and {*stated.left, *stated.right} <= set(standing):
-        return tuple(name for side in (stated.left, stated.right)
-                     for name in sorted(side, key=lambda one: -standing[one].place[0]))
+    """Joints that controllers drive by their speed, in order; None where these are no wheels in pairs."""
     names = [name for name in stated.by_speed if name in standing and standing[name].is_wheel]
     return _by_side(standing, names) if names else None
 
 
 def _refuse_steering(
-    path: Path, hinges: Mapping[str, Any], standing: Mapping[str, _Stand], stated: StatedDrive
-) -> None:
+    path: Path, hinges: Mapping[str, Any], standing: Mapping[str, _Stand], plugin: str
+) -> None:  # fmt: skip
     """Refuse wheels that are steered: what turns them is not in the file, and held straight they would skid."""
     remedy = ("robots that steer as cars and tricycles do are not read. Fit a function of your own (docs/models.md), "
               "or name the wheels that drive with --wheels to hold the steering straight.")
@@ -162,8 +189,8 @@ def _refuse_steering(
             if above.name in steered:
                 raise ValueError(f"{path}: wheel {name} is steered by joint {steered[above.name]}; {remedy}")
             above = above.parent
-    if stated.steering:
-        raise ValueError(f"{path}: its plugin {stated.steering} steers its wheels; {remedy}")
+    if plugin:
+        raise ValueError(f"{path}: its plugin {plugin} steers its wheels; {remedy}")
 
 
 def _has_end(joint: Any) -> bool:

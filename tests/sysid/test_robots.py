@@ -476,6 +476,34 @@ def test_tricycles_are_refused_by_the_name_of_their_steering_or_by_their_plugin(
         load_robot(robot_file(tmp_path, *rear, plugin("libgazebo_ros_ackermann_drive.so")))
 
 
+def test_a_plugin_that_only_is_called_after_steering_hinders_no_drive(tmp_path):
+    pose = plugin("libgazebo_ros_p3d.so").replace('"drive"', '"steering_pose"')
+    drive = plugin("libgazebo_ros_diff_drive.so", leftJoint="port", rightJoint="starboard")
+    for more in (pose, plugin("libgazebo_ros_ackermann_drive.so")):
+        robot = load_robot(robot_file(tmp_path, *ROLLING, drive, more))
+        assert [robot.host.actuator(one).name for one in robot.actuators] == ["port", "starboard"]
+
+
+@pytest.mark.parametrize(("left", "right", "said"), [
+    ("prot", "starboard", "a plugin drives joint prot, which is no joint of the file that turns .port, "),
+    ("port", "port", "a plugin drives joint port on both sides")])
+def test_a_plugin_whose_joints_are_misspelt_or_repeated_is_refused_by_their_name(tmp_path, left, right, said):
+    path = robot_file(tmp_path, *ROLLING, plugin("libgazebo_ros_diff_drive.so", leftJoint=left, rightJoint=right))
+    with pytest.raises(ValueError, match=said):
+        load_robot(path)
+    assert len(load_robot(path, ("port", "starboard")).wheels) == 2
+
+
+@pytest.mark.parametrize(("says", "said"), [
+    (plugin("libgazebo_ros_diff_drive.so", leftJoint="left_wheel"), "left_wheel on the left and no joint on the right"),
+    (f'<ros2_control name="base" type="system">{SPEEDS}</ros2_control>', "starboard, port, which the file lacks")])
+def test_joints_of_a_file_that_are_of_no_use_are_named_where_wheels_are_taken_by_their_names(tmp_path, says, said):
+    both = (wheel("left_wheel", 0, 0.2), wheel("right_wheel", 0, -0.2))
+    [note] = [one for one in load_robot(robot_file(tmp_path, *both, says)).notes if said in one]
+    assert "the driven wheels are taken to be left_wheel, right_wheel" in note
+    assert not any("are taken to be" in one for one in load_robot(robot_file(tmp_path, *both)).notes)
+
+
 def test_a_track_of_many_wheels_drives_as_one_side(tmp_path):
     names = [(f"{side}_track_wheel_{k}", -0.2 + 0.1 * k, y) for side, y in (("left", 0.2), ("right", -0.2))
              for k in range(5)]
