@@ -170,15 +170,16 @@ def _limits(robot: Robot, v: float) -> list[str]:
             found.append(f"joint {host.joint(joint).name} gives at most {host.jnt_actfrcrange[joint, 1]:.3g} N m "
                          "(effort, or actuatorfrcrange)")
     for one, joint in zip(robot.actuators, joints, strict=True) if not robot.motors and not robot.added else ():
+        called = host.actuator(one).name or f"of joint {host.joint(joint).name}"
         gain, damping = -host.actuator_biasprm[one, 2] * host.actuator_gear[one, 0] ** 2, host.dof_damping[
             host.jnt_dofadr[joint]]
         if damping > STRAIGHT * gain:
-            found.append(f"actuator {host.actuator(one).name} (kv {gain:.3g} N m s/rad) is held back by a damping of "
+            found.append(f"actuator {called} (kv {gain:.3g} N m s/rad) is held back by a damping of "
                          f"{damping:.3g} of joint {host.joint(joint).name}: it reaches {gain / (gain + damping):.0%} "
                          "of its speed")
         most = float(np.abs(host.actuator_ctrlrange[one]).max())
         if host.actuator_ctrllimited[one] and most * robot.wheel_radius < v:
-            found.append(f"actuator {host.actuator(one).name} takes at most {most:.3g} rad/s (ctrlrange), which is "
+            found.append(f"actuator {called} takes at most {most:.3g} rad/s (ctrlrange), which is "
                          f"{most * robot.wheel_radius:.3g} m/s")
     return found
 

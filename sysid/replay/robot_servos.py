@@ -45,15 +45,15 @@ def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
             what = (f"acts on tendon {one.target}" if on_tendon else "has a filter or a muscle" if lags else
                     "pulls by a law of its own" if damps else f"holds an angle of {one.target}")
             instead = "nothing" if on_tendon and one.target not in turned else "servos on the wheels"
-            notes.append(f"{path.name}: actuator {one.name} {what}: {instead} stands in for it"
+            notes.append(f"{path.name}: actuator {_called(one)} {what}: {instead} stands in for it"
                          .replace("wheels stands", "wheels stand"))
             spec.delete(one)
     left = [one for one in spec.actuators if one.target in joints]
     plain = {one.target for one in left if one.dyntype != mujoco.mjtDyn.mjDYN_INTEGRATOR}
     if left and plain != set(joints):
         why = "sum up a speed" if not plain else "are not on all of the wheels"
-        notes.append(f"{path.name}: actuators {', '.join(one.name for one in left)} {why}: servos on the wheels stand "
-                     "in for them")
+        notes.append(f"{path.name}: actuators {', '.join(map(_called, left))} {why}: servos on the wheels stand in "
+                     "for them")
         for one in left:
             spec.delete(one)
     remaining = {one.name for one in spec.actuators}
@@ -61,6 +61,12 @@ def drop_others(path: Path, spec: Any, joints: Sequence[str]) -> list[str]:
         if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname not in remaining:
             spec.delete(sensor)
     return notes
+
+
+def _called(actuator: Any) -> str:
+    """Name of an actuator, else of what it acts on."""
+    what = "tendon" if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON else "joint"
+    return actuator.name or f"of {what} {actuator.target}"
 
 
 def add_servos(

@@ -578,10 +578,20 @@ def test_servos_that_stand_in_for_other_actuators_reach_their_speed_whatever_the
     assert said in " ".join(robot.notes) and "friction and damping of joint left" in " ".join(robot.notes)
 
 
+@pytest.mark.parametrize(("acts", "said"), [
+    ('<intvelocity joint="left" kp="1" actrange="-9 9"/><intvelocity joint="right" kp="1" actrange="-9 9"/>',
+     "actuators of joint left, of joint right sum up a speed"),
+    ('<position joint="left" kp="1"/>', "actuator of joint left holds an angle of left"),
+    ('<motor tendon="ahead"/>', "actuator of tendon ahead acts on tendon ahead")])
+def test_an_actuator_without_a_name_is_called_after_what_it_acts_on(tmp_path, acts, said):
+    assert said in " ".join(load_robot(car_file(tmp_path, acts)).notes)
+
+
 def test_a_servo_that_its_bearing_holds_back_is_named(tmp_path):
     robot = load_robot(car_file(tmp_path, SERVOS))
     lines = "\n".join(describe_robot(robot, check_robot(robot)))
-    assert "held back by a damping of 0.03 of joint left: it reaches 25% of its speed" in lines
+    assert ("actuator of joint left (kv 0.01 N m s/rad) is held back by a damping of 0.03 of joint left: it reaches "
+            "25% of its speed") in lines
 
 
 def test_keyframes_of_the_file_do_not_hinder_what_is_added(tmp_path):
