@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from sysid.pages.report import code_hashes
 from sysid.replay.cores import cores
@@ -47,36 +46,28 @@ def settings_of(config: Any, without: Iterable[str] = ()) -> dict[str, Any]:
     """Name -> value of a settings dataclass for an identity, passwords hidden; files by their content."""
     found = {name: value for name, value in asdict(config).items() if name not in without}
     for name in {"vehicle", "model"} & set(found):
-        found[name] = file_label(found[name], found.get("wheels") or ())
+        found[name] = file_label(found[name])
+    if (model := Path(str(getattr(config, "model", None)))).suffix in ROBOT_FILES and model.is_file():
+        found["model_parts"] = parts_label(model)
     if "storage" in found:
         found["storage"] = without_secrets(found["storage"])
     return found
 
 
-def file_label(path: Path | str | None, wheels: Sequence[str] = ()) -> str | None:
-    """Name of a file with a checksum of its content; the text itself where there is no such file.
-
-    Of a robot file what it was read as counts as well: meshes and files that it includes are in it.
-    """
+def file_label(path: Path | str | None) -> str | None:
+    """Name of a file with a checksum of its content; the text itself where there is no such file."""
     if not path:
         return None
     text = str(path)
     file = Path(text.partition(".py:")[0] + ".py" if ".py:" in text else text)
     if not file.is_file():
         return text
-    content = hashlib.sha256(file.read_bytes())
-    if file.suffix in ROBOT_FILES:
-        content.update(_compiled(file, wheels))
-    return f"{Path(text).name} {content.hexdigest()[:12]}"
+    return f"{Path(text).name} {hashlib.sha256(file.read_bytes()).hexdigest()[:12]}"
 
 
-def _compiled(file: Path, wheels: Sequence[str]) -> bytes:
-    """The model of a robot file as MuJoCo compiles it."""
-    import mujoco
-
+def parts_label(path: Path) -> str:
+    """Number of the files that a robot file includes and of its meshes, with a checksum of names and contents."""
     from sysid.replay.robot_files import read_robot
 
-    model = read_robot(file, wheels).spec.compile()
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
+    parts = sorted((one.name, hashlib.sha256(one.read_bytes()).hexdigest()) for one in read_robot(path).parts)
+    return f"{len(parts)} files {hashlib.sha256(repr(parts).encode()).hexdigest()[:12]}"

@@ -45,13 +45,21 @@ class RobotFile:
     friction: dict[str, float] | None = None
     """Of links, as a URDF states it for Gazebo; None for MJCF, which has its own."""
     drive: StatedDrive = StatedDrive()  # joints that it says are driven
+    included: tuple[Path, ...] = ()
+
+    @property
+    def parts(self) -> list[Path]:
+        """Files that are part of the robot besides its own: included ones, meshes and height fields, each once."""
+        folder = Path(self.spec.modelfiledir or "") / (self.spec.meshdir or "")
+        solid = [folder / one.file for one in (*self.spec.meshes, *self.spec.hfields) if one.file]
+        return sorted({one.resolve() for one in (*self.included, *solid) if one.is_file()})
 
 
 def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | None = None) -> RobotFile:
     """The editable model of an MJCF, URDF or xacro file; FileNotFoundError or ValueError where it is none."""
     text = decoded(path, read_bytes(path, MODEL_BYTES, "no such model. Give an MJCF, URDF or xacro file."))
     xacro = path.suffix == ".xacro" or "<xacro:" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    text, left_out = expand_xacro(path) if xacro else (text, [])
+    text, left_out, included = expand_xacro(path) if xacro else (text, [], [])
     try:
         top = ElementTree.fromstring(text)
     except ElementTree.ParseError:
@@ -62,11 +70,31 @@ def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | Non
         raise ValueError(f"{path}: it begins with <{top.tag[:40]}>. {OTHER}")
     if top.tag != "robot":
         spec = mujoco.MjSpec.from_string(text) if xacro else mujoco.MjSpec.from_file(str(path))
-        return RobotFile(spec, [*left_out, *_place_meshes(path, spec)])
+        included += _included(path.parent, path, top)
+        return RobotFile(spec, [*left_out, *_place_meshes(path, spec)], included=tuple(included))
     drive = stated_drive(top)
     notes = [*left_out, *complete_links(path, top), *_place_urdf_meshes(path, top, wheels, wheel_radius)]
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode"))
-    return RobotFile(spec, notes, _frictions(top), drive)
+    return RobotFile(spec, notes, _frictions(top), drive, tuple(included))
+
+
+def _included(folder: Path, path: Path, top: ElementTree.Element) -> list[Path]:
+    """Files that an MJCF file in a folder includes or attaches, and those that they include."""
+    found: list[Path] = []
+    waiting = [(path, top)]
+    while waiting:
+        path, top = waiting.pop()
+        for element in (one for one in top.iter() if one.tag in ("include", "model") and one.get("file")):
+            places = [place / element.get("file", "") for place in (path.parent, folder)]
+            one = next((place for place in places if place.is_file() and place not in found), None)
+            if one is None:
+                continue
+            found.append(one)
+            try:
+                waiting.append((one, ElementTree.parse(one).getroot()))
+            except ElementTree.ParseError:
+                continue  # MuJoCo is less strict
+    return found
 
 
 def _frictions(top: ElementTree.Element) -> dict[str, float]:
@@ -81,8 +109,9 @@ def _frictions(top: ElementTree.Element) -> dict[str, float]:
     return found
 
 
-def expand_xacro(path: Path) -> tuple[str, list[str]]:
-    """Text of a xacro file with all macros expanded, by a process that may be stopped, and notes on missing files."""
+def expand_xacro(path: Path) -> tuple[str, list[str], list[Path]]:
+    """Text of a xacro file with all macros expanded, by a process that may be stopped; notes on missing files, and the
+    files that it includes."""
     if importlib.util.find_spec("xacro") is None:
         raise ValueError(f"{path}: xacro files need the package xacro. Install it: {XACRO}; or expand the file where "
                          "you have ROS: xacro FILE > robot.urdf.")
@@ -94,8 +123,9 @@ def expand_xacro(path: Path) -> tuple[str, list[str]]:
         said = done.stdout.decode("utf-8", errors="replace")
         if done.returncode == 0:
             lines = done.stderr.decode("utf-8", errors="replace").splitlines()
-            found = [one.removeprefix(xacro_text.LEFT_OUT) for one in lines if one.startswith(xacro_text.LEFT_OUT)]
-            return said, [f"{path.name}: {one}" for one in found]
+            missing, included = ([one.removeprefix(kind) for one in lines if one.startswith(kind)]
+                                 for kind in (xacro_text.LEFT_OUT, xacro_text.INCLUDED))
+            return said, [f"{path.name}: {one}" for one in missing], [Path(one) for one in included]
         limit = f"it takes more than {xacro_text.SECONDS} s of processor time"
         reason = said[:LONGEST_REASON] if done.returncode == 1 else limit
     except subprocess.TimeoutExpired:

@@ -1,7 +1,8 @@
 """Expands a xacro file in a process of its own: `python xacro_text.py FILE SECONDS`. What stands in it may never end.
 
 Prints the text, or, with exit code 1, what is wrong. `$(find PACKAGE)` also looks in the folders around the file.
-Files that other packages would include, and their macros, are left out; the error stream has a line for each.
+Files that other packages would include, and their macros, are left out; the error stream has a line for each,
+and for each file that was included.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 LEFT_OUT = "left out: "  # begins a line of what was left out
+INCLUDED = "included: "  # begins a line with a file that was read
 PARENTS = 4  # folders above the file in which packages are looked for
 SECONDS, BYTES = 10, 1_500_000_000  # processor time and memory; an arm with all its macros takes a second
 
@@ -83,6 +85,7 @@ def main() -> int:
     try:
         text, code = expand(Path(sys.argv[1]), left_out), 0
         sys.stderr.writelines(f"{LEFT_OUT}{one}\n" for one in left_out)
+        sys.stderr.writelines(f"{INCLUDED}{one}\n" for one in sys.modules["xacro"].all_includes)
     except BaseException as error:
         said = " ".join(str(error).split()) or type(error).__name__
         text, code = "; ".join([said, *left_out]), 1

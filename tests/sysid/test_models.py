@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import itertools
 import json
 import struct
@@ -26,11 +27,13 @@ from sysid.replay.differences import DifferenceReplay
 from sysid.replay.mjcf import mjcf_model
 from sysid.replay.model_files import load_model
 from sysid.replay.models import function_model, make_parameters, model_space, set_parameters
+from sysid.replay.robot_files import read_robot
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import default_paths, resolve, write_mjcf
-from sysid.run_folder import file_label
+from sysid.run_folder import parts_label, run_folder, settings_of
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
+from whill_mjx.io.folders import FolderRefused
 from whill_mjx.logs.manoeuvres import Scenario, command_table
 from whill_mjx.processor import FLAG, OPTION
 from whill_mjx.vehicle.specs import WHILL_CR
@@ -339,14 +342,40 @@ def test_another_mesh_or_included_file_makes_another_run(tmp_path, cube):
     (tmp_path / "part.xml").write_text(ROBOT)
     whole = tmp_path / "whole.xml"
     whole.write_text('<mujoco><include file="part.xml"/></mujoco>')
-    before, one = file_label(path), file_label(whole)
-    assert file_label(path) == before  # it is the same each time
+    before, one = parts_label(path), parts_label(whole)
+    assert parts_label(path) == before and before.startswith("1 files")  # it is the same each time
     mesh.write_bytes(cube.replace(np.float32(0.1).tobytes(), np.float32(0.2).tobytes()))
-    assert file_label(path) != before
+    assert parts_label(path) != before
     (tmp_path / "part.xml").write_text(ROBOT.replace('mass="0.5"', 'mass="0.6"'))
-    assert file_label(whole) != one
+    assert parts_label(whole) != one
 
 
+@pytest.mark.quick
+def test_a_run_of_a_robot_goes_on_while_its_files_are_the_same(tmp_path, cube):
+    """Folders of earlier versions have the file's own checksum only; they go on too."""
+    path, mesh = tmp_path / "cart.urdf", tmp_path / "body.stl"
+    path.write_text(URDF.replace("</inertial>", "</inertial>" + BODY.format("body.stl"), 1))
+    mesh.write_bytes(cube)
+
+    def go_on(folder, identity=None):
+        with run_folder(tmp_path / folder, "sysid.fit", (), identity or settings_of(FitConfig(model=str(path)))):
+            (tmp_path / folder / "work").touch()
+
+    earlier = settings_of(FitConfig(model=str(path)))
+    assert earlier["model"] == f"cart.urdf {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+    go_on("new")
+    go_on("new")
+    go_on("old", {name: value for name, value in earlier.items() if name != "model_parts"})
+    go_on("old")
+    mesh.write_bytes(cube.replace(np.float32(0.1).tobytes(), np.float32(0.2).tobytes()))
+    with pytest.raises(FolderRefused, match="model_parts is 1 files"):
+        go_on("new")
+    path.write_text(path.read_text().replace("0.45", "0.46"))
+    with pytest.raises(FolderRefused, match="model is cart.urdf"):
+        go_on("old")
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize("content", [None, b"solid body\n facet normal 0 0 1\n", b"", b"not a mesh"])
 def test_a_mesh_that_is_missing_or_unreadable_becomes_a_box_of_its_links_inertia_with_a_note(tmp_path, content):
     path = tmp_path / "cart.urdf"
@@ -393,6 +422,7 @@ def test_a_xacro_file_is_expanded_with_packages_from_the_folders_around_it(tmp_p
                                                                      'cylinder radius="${radius}"')
     path.write_text(text)
     assert load_robot(path).wheel_radius == pytest.approx(0.1)
+    assert [one.name for one in read_robot(path).parts] == ["sizes.xacro"]
     path.write_text(text.replace("find cart_description", "find nowhere"))
     with pytest.raises(ValueError, match="xacro cannot expand it: .*'radius'.*; package://nowhere/.* is not found"):
         load_robot(path)
