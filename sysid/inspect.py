@@ -27,7 +27,7 @@ from sysid.logs.inspection import inspect, load_whole, text
 from sysid.logs.next_drives import NextDrive, next_drives
 from sysid.logs.records import Log
 from whill_mjx.io.command_line import POSITIVE, Range
-from whill_mjx.io.folders import check_file, claim_folder, note_written
+from whill_mjx.io.folders import check_file, claim_folder, note_written, whole_file
 from whill_mjx.io.formats import stamp
 
 KIND = "sysid.inspect"
@@ -61,7 +61,10 @@ class InspectConfig:
 
 
 def inspect_robot(config: InspectConfig) -> dict[str, Any]:
-    """What a robot file is understood as: printed, with a picture."""
+    """What a robot file is understood as: printed, with a picture.
+
+    Without --out a picture that cannot be written is only said so; it is refused where somebody asked for it.
+    """
     from dataclasses import asdict
 
     from sysid.pages.report import plain
@@ -70,16 +73,24 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
     from sysid.replay.robot_loading import load_robot
 
     picture = (config.out or Path()) / f"{config.dataset.name.partition('.')[0]}.png"
-    check_file("--out" if config.out else "picture", picture)
     robot = load_robot(config.dataset, config.wheels)
     check = check_robot(robot)
     found = {"wheel_radius": robot.wheel_radius, "track": robot.distance, "driven_wheels": len(robot.wheels),
              "mass": float(robot.host.body_mass.sum()), "notes": list(robot.notes), **asdict(check),
              "drives_straight": check.drives_straight}
     print(json.dumps(plain(found), indent=1) if config.json else "\n".join(describe_robot(robot, check)))
-    if config.out is not None:
-        config.out.mkdir(parents=True, exist_ok=True)
-    write_robot(picture, robot, check.loads)
+    try:
+        if config.out is None:
+            check_file("picture", picture, "give --out FOLDER")
+        else:
+            check_file("--out", picture, "choose another --out")
+    except OptionError as refused:
+        if config.out is not None:
+            raise
+        print(f"no {refused}", file=sys.stderr)
+        return found
+    with whole_file(picture) as temporary:
+        write_robot(temporary, robot, check.loads)
     note_written(picture)
     print(f"wrote {picture}", file=sys.stderr)
     return found

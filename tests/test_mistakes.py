@@ -64,7 +64,7 @@ def mistakes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mistakes")
     shutil.copytree(CHAIR, folder / "data")
     (folder / "file").write_text("")
-    for name in ("mine.csv", "other_2.csv", "robot.png", "robot.urdf"):
+    for name in ("mine.csv", "other_2.csv", "robot.urdf"):
         (folder / name).write_text("mine")
     (folder / "folder.csv").mkdir()
     (folder / "mine").mkdir()
@@ -99,7 +99,7 @@ def mistakes(tmp_path_factory):
     ("close_loop", "data --reference-train a", "--reference-train: has an effect only with --reference"),
     ("design", "whill_cr --out mine.csv", "--out mine.csv: exists already, and is not as a command of this project"),
     ("design", "whill_cr --out other.csv --count 2", "--out other_2.csv: exists already"),
-    ("inspect", "robot.urdf", "robot.png: exists already"),
+    ("inspect", "robot.urdf", "robot.urdf: MuJoCo cannot use it"),
     ("design", "whill_cr --out data/trials/circle_1/command.csv", "lies among the trials of"),
     ("convert", "data --out new --fps 10", "--fps: has an effect only with --to lerobot"),
     ("convert", "data --out new --pause 3", "--pause: has an effect only with --split standstill"),

@@ -20,6 +20,7 @@ from sysid.replay.robot_check import check_robot, describe_robot
 from sysid.replay.robot_files import expand_xacro
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import default_paths
+from whill_mjx.io.folders import FolderRefused
 from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 pytestmark = pytest.mark.quick
@@ -244,6 +245,20 @@ def test_inspect_says_what_was_understood_and_draws_it(tmp_path, capsys):
     assert (tmp_path / "seen" / "robot.png").stat().st_size > 5000 and found["drives_straight"]
     inspect_module.main(inspect_module.InspectConfig(dataset=path, out=tmp_path / "seen", json=True))
     assert json.loads(capsys.readouterr().out)["driven_wheels"] == 2
+
+
+def test_what_was_found_of_a_robot_is_printed_although_its_picture_is_somebodys(tmp_path, capsys, monkeypatch):
+    path = robot_file(tmp_path, *TWO)
+    (tmp_path / "robot.png").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    inspect_module.main(inspect_module.InspectConfig(dataset=path, json=True))
+    said = capsys.readouterr()
+    assert json.loads(said.out)["driven_wheels"] == 2
+    assert "no picture robot.png: exists already" in said.err and "give --out FOLDER, or remove it" in said.err
+    with pytest.raises(FolderRefused, match="choose another --out, or remove it"):
+        inspect_module.main(inspect_module.InspectConfig(dataset=path, json=True, out=tmp_path))
+    assert json.loads(capsys.readouterr().out)["driven_wheels"] == 2
+    assert (tmp_path / "robot.png").read_text() == "mine"
 
 
 def test_json_of_a_robot_is_all_that_comes_on_stdout(tmp_path):

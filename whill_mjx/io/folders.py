@@ -72,14 +72,17 @@ def write_whole(path: Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode(errors="replace") if isinstance(content, str) else content)
 
 
-def check_file(option: str, path: Path) -> None:
-    """Raise FolderRefused where a file cannot be written at `path`, or is there and not as `note_written` knows it."""
+def check_file(option: str, path: Path, instead: str = "choose another name") -> None:
+    """Raise FolderRefused where a file cannot be written at `path`, or is there and not as `note_written` knows it.
+
+    `instead`: what the caller may do about a file that is not replaced.
+    """
     check_place(option, path)
     if path.is_dir():
         raise FolderRefused(f"{option} {path}: is a folder. Give the name of a file.")
     if path.exists() and (not path.is_file() or _written(path.parent).get(path.name) != _checksum(path)):
-        raise FolderRefused(f"{option} {path}: exists already, and is not as a command of this project wrote it. It is "
-                            "not replaced: choose another name, or remove it.")
+        raise FolderRefused(f"{option} {path}: exists already, and is not as a command of this project wrote it (or an "
+                            f"earlier version did). It is not replaced: {instead}, or remove it.")
 
 
 def note_written(*paths: Path) -> None:
