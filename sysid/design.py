@@ -86,10 +86,11 @@ def main(config: DesignConfig) -> list[Path]:
     paths = []
     for path, plan in zip(command_files(config), found.chosen, strict=False):
         write_csv(path, COMMAND_HEADER, plan.candidate.command.table)
+        note_written(path)  # at once: the same command may follow an interrupt
         paths.append(path)
     print(text(found, config.criterion))
     paths.append(write_page(config.out.with_suffix(".html"), found, limits, config, describe(subject.params)))
-    note_written(*paths)
+    note_written(paths[-1])
     for path in paths:
         print(f"wrote {path}")
     return paths

@@ -60,8 +60,9 @@ def main(options: Import) -> None:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, walls=made.walls.segments, start=places.start, goal=places.goal, way=places.way)
     write_whole(arrays, buffer.getvalue())
+    note_written(arrays)
     write_whole(picture, from_above(made, options.pixels))
-    note_written(picture, arrays)
+    note_written(picture)
     print(f"{picture}, {arrays}")
 
 

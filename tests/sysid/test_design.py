@@ -180,6 +180,21 @@ def test_the_command_file_is_a_log_and_stays_in_the_room(whill):
     assert "forward_slip.eta" in page and "path in the room" in page and 'href="http' not in page
 
 
+def test_the_same_command_replaces_what_an_interrupted_one_wrote(tmp_path, monkeypatch):
+    monkeypatch.setattr("sysid.intervals.design.vehicle_plant", stand_in)
+    config = DesignConfig("whill_cr", tmp_path / "next.csv", space=(5.0, 5.0), v_max=0.6, omega_max=0.8, seconds=3.0,
+                          parameters=("pid_drive.kp",))
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("sysid.pages.design_page.write_page", interrupted)
+        main(config)
+    assert (tmp_path / "next.csv").exists() and not (tmp_path / "next.html").exists()
+    design_command.check_out(config)
+
+
 @quick
 def test_an_unknown_vehicle_ends_with_one_line(monkeypatch):
     monkeypatch.setattr("sys.argv", ["design", "tricycle"])
