@@ -78,9 +78,9 @@ class Benchmark:
     """What is driven, of `benchmarks.plant.chair.VEHICLES`; each needs a `work` of its own. `speed` and `classes`
     are of the chair."""
     draw: Annotated[int, NOT_NEGATIVE] = 0
-    """Another draw of all that is driven: other seeds, reference days and pairs. Each needs a `work` of its own; the
-    names of its verdicts have its number, so those of several draws can be collected from one folder. Their figures
-    end in `_fresh`: the weights of the decision were chosen with draw 0 in view."""
+    """Another draw of all that is driven: other seeds, reference days and pairs. The names of its days, logs and
+    verdicts have its number, so several draws may share a `work`. Their figures are taken together, without draw 0,
+    and end in `_fresh`: the weights of the decision were chosen with draw 0 in view."""
     pairs: Annotated[int, NOT_NEGATIVE] = 0
     """Logs with two effects of 4 times that size; after the sizes of all effects are there."""
     left_out: bool = False

@@ -43,7 +43,7 @@ SAME = {  # effects that the plant and the catalogue write alike: parameter, its
 
 def figures(work: Path, driven: Driven = USUAL) -> None:
     """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept."""
-    cases = list(read_cases(work))
+    cases = [(truth, one) for truth, one in read_cases(work) if bool(one.get("draw", 0)) == bool(driven.draw)]
     noisy = [(truth, one) for truth, one in cases if one["stage"] == "noisy"]
     cases = [(truth, one) for truth, one in cases if one["stage"] != "noisy"]
     found = {**of_nulls([one for truth, one in cases if not truth]), **of_noisy(noisy)}
@@ -65,7 +65,7 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
     if timed:
         found["seconds_per_log"] = figure([one["seconds"] for one in timed], "s on one core, reference fit apart",
                                           timed[0]["device"])
-    found.update(of_speed(work))
+    found.update({} if driven.draw else of_speed(work))
     found.update(of_decision([one["findings"] for _, one in [*cases, *noisy] if one.get("findings")]))
     found = {name + driven.tag: one for name, one in found.items()}
     recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}

@@ -31,7 +31,7 @@ from whill_mjx.vehicle.presets import preset_params
 
 @dataclass(frozen=True)
 class Driven:
-    """What drives the logs; each needs a folder of its own."""
+    """What drives the logs; each vehicle and each noise needs a folder of its own."""
 
     noise: float = 1.0
     """Factor on all disturbances and sensor noise."""
@@ -66,9 +66,9 @@ SETS = 800
 """More sets would use the seeds of other logs."""
 
 
-def folder_of(work: Path, number: int) -> Path:
+def folder_of(work: Path, number: int, driven: Driven = USUAL) -> Path:
     """Where the days of a set are."""
-    return work / ("reference" if number == 0 else f"reference_{number}")
+    return work / driven.label("reference" if number == 0 else f"reference_{number}")
 
 
 def reference_days(work: Path, driven: Driven = USUAL, number: int = 0) -> list[Log]:
@@ -84,7 +84,7 @@ def reference_days(work: Path, driven: Driven = USUAL, number: int = 0) -> list[
         raise ValueError(f"set of reference days {number}: must be 0 to {SETS - 1}. Ask for fewer sets.")
     days = []
     for day in range(DAYS):
-        path = folder_of(work, number) / f"day_{day + 1}"
+        path = folder_of(work, number, driven) / f"day_{day + 1}"
         if not path.exists():
             try:
                 make_log(path, Experiment(seed=driven.seed(FIRST_SEED + SEEDS * number + day), noise=driven.noise,
@@ -107,7 +107,7 @@ def reference_of(logs: Sequence[Log], config: LoopConfig) -> Reference:
 def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Prepared:
     """A set ready for `find_missing`; its days are driven, and fitted, where that was not done before."""
     days = reference_days(work, driven, number)
-    path = folder_of(work, number) / f"fitted_{_key(days, config)}.pickle"
+    path = folder_of(work, number, driven) / f"fitted_{key_of(days, config)}.pickle"
     reference = None
     if path.exists():
         try:
@@ -120,9 +120,9 @@ def prepared(work: Path, number: int, driven: Driven, config: LoopConfig) -> Pre
     return prepare(reference, days[0].spec, config)
 
 
-def _key(days: Sequence[Log], config: LoopConfig) -> str:
-    """Of everything that a fit depends on: code, versions, data and settings."""
-    settings = repr((sorted(code_hashes().items()), [day.sha256 for day in days], config))
+def key_of(days: Sequence[Log], config: LoopConfig, *more: str) -> str:
+    """Hash of everything that a fit depends on: code, versions, data, settings, and what else there is."""
+    settings = repr((sorted(code_hashes().items()), [day.sha256 for day in days], config, *more))
     return hashlib.sha256(settings.encode()).hexdigest()[:16]
 
 

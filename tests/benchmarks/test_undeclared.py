@@ -105,6 +105,7 @@ def test_what_was_judged_in_another_folder_stays_recorded(tmp_path, results):
 @pytest.mark.quick
 def test_logs_of_later_draws_have_figures_of_their_own_beside_those_of_the_first(tmp_path, results):
     recorded = json.loads(results.read_text())
+    judged(tmp_path, "null_000", NOTHING, {})  # of draw 0, in the same folder
     for draw in (1, 2):
         judged(tmp_path, f"null_000_draw_{draw}", {**NOTHING, "draw": draw}, {})
     undeclared_figures.figures(tmp_path, Driven(draw=1))

@@ -67,7 +67,7 @@ def test_another_draw_shares_no_seed_name_or_pair_with_the_first(tmp_path, drive
     monkeypatch.setattr(contact, "brief", lambda _: {})
     monkeypatch.setattr(contact, "load_log", str)
     asked = {"nulls": 3, "scales": (2.0, 4.0), "pairs": 9, "sensor_noise": (2.0,), "noisy_nulls": 3}
-    draws = [undeclared.Benchmark(**asked, draw=draw, work=tmp_path / str(draw)) for draw in (0, 1, 2)]
+    draws = [undeclared.Benchmark(**asked, draw=draw, work=tmp_path) for draw in (0, 1, 2)]
     logs, seeds = [undeclared.wanted(one) for one in draws], []
     for settings, listed in zip(draws, logs, strict=True):
         driven.clear()
@@ -79,6 +79,12 @@ def test_another_draw_shares_no_seed_name_or_pair_with_the_first(tmp_path, drive
     assert len(set(seeds)) == len(seeds)
     assert len({job.label for listed in logs for job in listed}) == 3 * len(logs[0])
     assert len({str([job.effects for job in listed if job.stage == "pair"]) for listed in logs}) == 3
+
+
+def test_a_draw_is_not_judged_against_the_days_of_another_in_the_same_folder(tmp_path, driven):
+    first = {day.sha256 for day in days.reference_days(tmp_path)}
+    assert first.isdisjoint(day.sha256 for day in days.reference_days(tmp_path, days.Driven(draw=1)))
+    assert len(set(driven.values())) == len(driven) == 2 * days.DAYS
 
 
 def test_a_log_of_another_draw_is_asked_for_by_its_name_in_the_first(tmp_path):
