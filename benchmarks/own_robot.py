@@ -29,6 +29,7 @@ from benchmarks.harness import figure, record
 from benchmarks.logs import CLAIM
 from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.first_day import SLOWER, SMALL, Day, Wrong, make_uncalibrated, write_urdf
+from benchmarks.undeclared_reference import key_of
 from sysid.logs.log import load_log, of_file
 from sysid.missing.fit_statistics import load_fitted
 from sysid.pages.fit_report import fit_dataset
@@ -100,7 +101,7 @@ def ready_robot(config: Benchmark, loop: LoopConfig) -> tuple[Prepared, VehicleS
     """The robot ready for verdicts, its spec, and its vehicle file. The first process drives the days, fits the robot
     and makes its reference; those that come later find each of these steps done."""
     out, began = config.out, time.perf_counter()
-    fitted, made = out / "fit" / "vehicle.toml", out / "reference.pickle"
+    fitted = out / "fit" / "vehicle.toml"
     with alone(out / ".lock"):
         days = [load_log(drive(out / f"day_{k + 1}", FIRST_SEED + k, 3 if k == 0 else 1)) for k in range(config.days)]
         if not fitted.exists():
@@ -109,6 +110,7 @@ def ready_robot(config: Benchmark, loop: LoopConfig) -> tuple[Prepared, VehicleS
             print(f"fitted, {time.perf_counter() - began:.0f} s", flush=True)
         spec, vehicle = load_fitted(fitted)
         days = [of_file(day, spec, str(fitted)) for day in days]
+        made = out / f"reference_{key_of(days, loop, fitted.read_text())}.pickle"
         try:
             reference = kept.loads(made.read_bytes())
         except (FileNotFoundError, kept.KeptError):
