@@ -292,7 +292,7 @@ class Objective:
         """Residual and Jacobian after the best start-pose error of each trial, with that error itself appended.
 
         A start error n = (dx, dy, dyaw) moves the simulated pose by A n; n minimises |r + A n|^2 + |n / sigma|^2, a
-        linear map of r that is applied to the Jacobian as well. Samples that are far off (`robust.HUBER`) weigh less in
+        linear map of r that is applied to the Jacobian as well. Samples that are far off (`space.HUBER`) weigh less in
         it. The odometry, which is counted from its own standstill, has such an error of its own.
         """
         noise, starts = self.noise, [trial.start for trial in self.trials]

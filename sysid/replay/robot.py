@@ -20,7 +20,7 @@ class Robot:
     root: int  # address of the free joint in qpos
     speed: int  # address of the free joint in qvel
     wheels: tuple[int, ...]
-    """Addresses of the driven wheels in qvel: one to three on the left, then as many on the right."""
+    """Addresses of the driven wheels in qvel: those on the left, then as many on the right."""
     actuators: tuple[int, ...]
     sign: tuple[float, ...]  # 1 where a positive speed of the joint drives forwards
     motors: bool  # the actuators take a torque, and not a speed
