@@ -72,7 +72,7 @@ class Rival:
 
 
 def next_manoeuvre(result: Result) -> dict[str, Any] | None:
-    """The drive that best separates the rivals of a verdict; None where the verdict has none.
+    """The drive that best separates the rivals of a verdict; None where it has none, or no drive is short enough.
 
     Returns:
         `name`, `parameters` {v [m/s], omega [rad/s], seconds, dt [s]} and `start` {x, y [m], heading [rad]} of the
@@ -89,6 +89,8 @@ def next_manoeuvre(result: Result) -> dict[str, Any] | None:
     pairs = [pair for group in groups for pair in combinations(group, 2)]
     room_fixed = any(EFFECTS[one.effect].room_fixed for group in groups for one in group)
     library = drive_library(result, HEADINGS if room_fixed else HEADINGS[:1])
+    if not library:
+        return None
     separation, library = separations(result, refitter, groups, library)
     return _proposal(pairs, separation, library)
 
@@ -166,6 +168,8 @@ def _fitting(whole: PlannedDrive, low: np.ndarray, high: np.ndarray, longest: fl
     heading = whole.start[2]
     for fraction in FRACTIONS:
         drive = replace(whole, seconds=math.floor(10 * fraction * whole.seconds + 1e-9) / 10)
+        if drive.seconds <= 0:
+            return None
         command = drive.command
         if command.t[-1] + drive.dt > longest + 1e-9:
             continue

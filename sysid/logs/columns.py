@@ -171,10 +171,11 @@ def guess(
     """
     found = list(said)
     taken = {(one.file, one.name) for one in said}
+    settled = _settled_commands({one.role for one in said})
     for table in tables:
         roles = {one.role for one in found if one.role != "time"}
         candidates = [column for name in table.columns if (table.stem, name) not in taken
-                      and (column := _by_name(table, name)) is not None]
+                      and (column := _by_name(table, name)) is not None and column.role not in settled]
         long_unit = {"min", "h", "d"}  # a column of hours may stand beside the time itself
         for column in sorted(candidates, key=lambda one: (not one.sure, one.role == "time" and one.unit in long_unit)):
             rival = column.role == "time" and any(one.role == "time" and one.file == table.stem for one in found)
@@ -191,6 +192,12 @@ def guess(
     open_ones = {(one.role, one.name) for one in decided if one.assumed and (one.role, one.name) in units}
     return _units_by_numbers([replace(one, unit=units[one.role, one.name], why=f"{one.why}; as most drives show")
                               if (one.role, one.name) in open_ones else one for one in found], arrays)
+
+
+def _settled_commands(said: set[str]) -> set[str]:
+    """Roles of commands that are not looked for: those of the other form, where somebody said a whole command."""
+    forms = [{f"command.{one}" for one in form} for form in (("v", "omega"), ("left", "right"))]
+    return {role for form, other in zip(forms, reversed(forms), strict=True) if form <= said for role in other}
 
 
 def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:
@@ -349,7 +356,7 @@ def _split_unit(name: str) -> tuple[str, str]:
 
 
 def _unit(text: str) -> str:
-    text = text.strip().lower().replace("²", "2")
+    text = re.sub(r"/ ?sec(onds?)?$", "/s", text.strip().lower().replace("²", "2"))
     return SPELLED.get(text, text)
 
 

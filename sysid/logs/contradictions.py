@@ -254,8 +254,16 @@ def _empty_shares(trial: Trial) -> tuple[float, float] | None:
     shares = []
     for rate, speed in ((np.hypot(x, y), stream.v), (turn, stream.omega)):
         faster = rate > max(MOVING, FASTER * float(np.percentile(rate, 95)))
-        shares.append(float((speed == 0)[faster].mean()) if faster.sum() > 10 else float("nan"))
+        shares.append(float(_silent(stream.t, speed, half)[faster].mean()) if faster.sum() > 10 else float("nan"))
     return shares[0], shares[1]
+
+
+def _silent(t: np.ndarray, speed: np.ndarray, half: float) -> np.ndarray:
+    """Rows (T,) around which a speed is exactly zero for as long as the pose is looked at, and a row more."""
+    moved = np.concatenate([[0], np.cumsum(speed != 0)])
+    first = np.maximum(np.searchsorted(t, t - half) - 1, 0)
+    last = np.minimum(np.searchsorted(t, t + half, side="right") + 1, len(t))
+    return np.asarray(moved[last] == moved[first])
 
 
 JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step that is a jump

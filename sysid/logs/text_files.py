@@ -44,6 +44,8 @@ ONE_SIDE = 0.5  # of the squares of qx and qy of a vehicle that lies on its side
 DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})[ T/,-]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)?"
                   r" *([AaPp][Mm])?")
 """A date and a time of day, as spreadsheets, MATLAB and `rostopic echo -p` write them."""
+NUMBERED = re.compile(r"(\d+(?:(?:[\s,]+|\s*\.\.\s*)\d+)*)[\s:.)]+([^\W\d].*)")
+"""A comment that gives columns names by their numbers, as loggers for MATLAB write it."""
 PREAMBLE = 30  # lines above the names
 BACK = (3.0, 0.1)  # usual steps, and s, by which a row may be older than the one before it: it came out of order
 NAMED = 12  # columns that an error lists
@@ -149,6 +151,8 @@ def read_table(path: Path) -> Table:
     data = _without_preamble(path, data, split)
     if stacked := _stacked_names([_cells(line, split) for _, line in data[:PREAMBLE]]):
         header, data = stacked[0], data[stacked[1] :]
+    elif numbered := _numbered_names(comments, _cells(data[0][1], split)):
+        header = numbered
     elif comments and path.read_bytes()[:1] == b"%" and (
             len(_cells(comments[0], split)) == len(_cells(data[0][1], split))):
         header = _cells(comments[0], split)  # of `rostopic echo -p`
@@ -263,6 +267,41 @@ def _stacked_names(rows: Sequence[Sequence[str]]) -> tuple[list[str], int] | Non
         names = [f"{over} {name}".strip() for over, name in zip(above, names, strict=True)]
     names = [name or over for name, over in zip(names, above, strict=True)]
     return [with_unit(name, unit) for name, unit in zip(names, rows[first - 1], strict=True)] if units else names, first
+
+
+def _numbered_names(comments: Sequence[str], row: Sequence[str]) -> list[str] | None:
+    """Names that comments give to columns by their numbers, as `% 2,3 Velocity left, right (m/s)`, counted from 0 or 1;
+    None where no two lines do so, or where they number more columns than a row of numbers has."""
+    if not _is_numbers(row):
+        return None
+    found = [([int(one) for one in re.findall(r"\d+", match[1])], match[2]) for line in comments
+             if (match := NUMBERED.fullmatch(line.strip()))]
+    places = [place for numbers, _ in found for place in numbers]
+    if len(found) < 2 or (first := min(places)) > 1 or max(places) - first >= len(row):
+        return None
+    names = [f"column{k + 1}" for k in range(len(row))]
+    for numbers, text in found:
+        for place, name in zip(numbers, _names_in(text, len(numbers)), strict=True):
+            names[place - first] = f"{name} {place}" if name in names else name
+    return names
+
+
+def _names_in(text: str, count: int) -> list[str]:
+    """So many names in a text like `Pose x, y, h [m, m, rad]: 0.0 0.1 0.2`, each with its unit; sample values go."""
+    text = re.sub(r"\s[-+]?\d+(\.\d*)?(?=\s|$)", "", text.partition(":")[0])
+    match = re.search(r"[\[(]([^\])]*)[\])]", text)
+    before, inside, after = (text[: match.start()], match[1], text[match.end() :]) if match else (text, "", "")
+    units = [one.strip() for one in inside.split(",")]
+    parts = [one.strip() for one in (before if count == 1 else f"{before.strip()} {after.strip()}").split(",")]
+    if len(parts) == count > 1:
+        shared, _, parts[0] = parts[0].rpartition(" ")
+        parts = [f"{shared} {one}".strip() for one in parts]
+    elif count > 1:
+        parts = [f"{' '.join(parts)} {k + 1}" for k in range(count)]
+    else:
+        parts = [before.strip()]
+    units = units if len(units) == count else count * units[:1]
+    return [with_unit(name, unit) if unit_named(unit) else name for name, unit in zip(parts, units, strict=True)]
 
 
 def _numbers(cells: Sequence[str]) -> np.ndarray:

@@ -31,7 +31,7 @@ REST = 0.02  # m/s and rad/s below which a vehicle rests
 def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, width: float,
                     channels: int = len(CHANNELS)) -> dict[str, float]:
     """By how much smooth functions of each quantity, fitted to two thirds of the trials, lower the sum of squares of
-    the white residual (B, n) of the others, in bins of a width [s] with so many channels."""
+    the white residual (B, n) of the others, in bins of a width [s] with so many channels; 0 where one trial is all."""
     bins = residual.shape[1] // channels
     residual = residual.reshape(len(trials), bins, channels)
     found = [quantities(trial, bins, width, spec) for trial in trials]
@@ -47,9 +47,11 @@ def held_back_gains(trials: Sequence[Trial], spec: Any, residual: np.ndarray, wi
             turns = np.kron(np.eye(1 + len(MEMORY)), wave_turns(WAVES, False))
         for part in range(3):
             fit, test = fold != part, fold == part
+            if not fit.any() or not test.any():  # one drive alone predicts none
+                continue
             solution, _ = align(x[fit], y[fit], turns, RIDGE * np.eye(x.shape[1]))
             gain += float(gains_at(solution, x[test], y[test], turns).max(1).sum())
-        if name in WHEELS:
+        if name in WHEELS and len(trials) > 1:
             gain -= ANGLE_PRICE * len(trials)
         out[name] = gain
     return out

@@ -439,12 +439,13 @@ def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Referen
 
 
 def where_it_lives(result: Result) -> list[dict[str, Any]]:
-    """Quantities by the share of the systematic residual that they predict on other drives, best first."""
+    """Quantities by the share of the systematic residual that they predict on other drives, where any; best first."""
     residual, excess = result.search.final.residual, result.search.excess[1]
     beyond = max(excess / (1 + excess) * float(np.square(residual).sum()), 1.0)
     gains = held_back_gains(result.log.training, result.log.spec, residual, result.reference.width,
                             result.reference.channels)
-    out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()]
+    out = [{"quantity": name, "share": float(np.clip(gain / beyond, 0.0, 1.0))} for name, gain in gains.items()
+           if gain > 0]
     return sorted(out, key=lambda one: -one["share"])
 
 

@@ -45,6 +45,15 @@ def straight_trial(pose=True):
                  OdometryStream(s, None, None, None, 0 * s, 0 * s), truth if pose else None, Start())
 
 
+def cut_to(trial, seconds):
+    """The first seconds of a trial."""
+    c, o, g = trial.command, trial.odometry, trial.ground_truth
+    few, some, part = (one.t <= seconds for one in (c, o, g))
+    return replace(trial, command=Command(c.t[few], c.v[few], c.omega[few]),
+                   odometry=OdometryStream(o.t[some], None, None, None, o.v[some], o.omega[some]),
+                   ground_truth=PoseStream(*(one[part] for one in (g.t, g.x, g.y, g.yaw))))
+
+
 @pytest.fixture(scope="module")
 def subject():
     """A vehicle with four effects, its reference, and its replay."""
@@ -149,6 +158,15 @@ def test_nothing_is_proposed_where_nothing_is_named(subject):
     alone.search.classes, alone.search.rounds = [["slope"]], [[best]]
     assert next_manoeuvre(alone) is None
     assert write_next_command("unused", None) is None
+
+
+@quick
+def test_nothing_is_proposed_where_the_drives_are_shorter_than_the_standstills(subject):
+    short = SimpleNamespace(spec=subject.log.spec, training=(cut_to(straight_trial(), 1.5),), name="short")
+    best, other = fitted(subject, "slope", along_x=0.01), fitted(subject, "side_force", sideways=5.0)
+    result = with_rivals(SimpleNamespace(**{**vars(subject), "log": short}), best, other)
+    assert drive_library(result) == []
+    assert next_manoeuvre(result) is None
 
 
 @quick

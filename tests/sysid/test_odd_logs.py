@@ -15,6 +15,7 @@ from sysid.logs.metrics import CHANNELS
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 from sysid.logs.streams import clock_shift, response_shift
 from sysid.logs.unusable import stood, without_standing
+from sysid.logs.wheel_states import integrate_speeds
 from sysid.logs.windows import WINDOW, in_windows
 from whill_mjx.vehicle.specs import WHILL_CR
 
@@ -237,3 +238,14 @@ def test_of_two_clocks_that_come_apart_the_faster_ones_gain_shows_no_unit(name):
     assert sanity(log_of(*trials)) == []
     (said,) = sanity(log_of(*fast))
     assert re.match("(ground_truth|odometry): its clock runs", said)
+
+
+def test_a_wheel_that_sticks_and_slips_is_no_empty_twist():
+    t = np.arange(0.0, 6.0, 0.02)
+    omega = np.where((t % 0.3 < 0.1) & (t > 1), 2.0, 0.0)
+    v = np.full(len(t), 0.3)
+    odometry = OdometryStream(t, *integrate_speeds(t, v, omega), v, omega)
+    trial = Trial("stuck_1", "stuck", Command(t, v, np.full(len(t), 0.7)), odometry, None, Start())
+    assert not [one for one in sanity(log_of(trial)) if "does not fill the twist" in one]
+    assert [one for one in sanity(log_of(replace(trial, odometry=replace(odometry, omega=0 * omega))))
+            if "speeds omega are all zero" in one]

@@ -15,6 +15,7 @@ from bridge.whill import ChairState, WheelOdometry
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log
 from sysid.logs.records import Command, with_timeout
+from sysid.logs.text_files import read_table
 from sysid.logs.wheel_states import chair_odometry, chair_row, joint_row, joint_twist
 from sysid.replay.wheel_model import wheel_model
 from whill_mjx.io.fields import DATASET
@@ -59,7 +60,7 @@ def check(trial, pose=True):
 def with_units(c):
     return {"time [ms]": 1e3 * c["t"], "cmd_speed [km/h]": 3.6 * c["cv"], "cmd_turn (deg/s)": np.rad2deg(c["cw"]),
             "x_mm": 1e3 * c["x"], "y_mm": 1e3 * c["y"], "heading [deg]": np.rad2deg(c["yaw"]) % 360,
-            "speed_kmh": 3.6 * c["v"], "yaw rate [deg/s]": np.rad2deg(c["w"])}
+            "speed_kmh": 3.6 * c["v"], "yaw rate [deg/sec]": np.rad2deg(c["w"])}
 
 
 def without_units(c):
@@ -492,3 +493,43 @@ def test_a_base_with_a_time_out_stops_in_pauses_of_the_commands():
     np.testing.assert_allclose(held.t, [0.0, 0.1, 0.2, 0.7, 3.0, 3.1])
     np.testing.assert_allclose(held.v, [0.5, 0.5, 0.5, 0.0, 0.5, 0.0])
     assert "command_timeout" in {field.name for field in DATASET}
+
+
+def wheel_speeds(c, track=0.5):
+    """Commanded and measured speeds [m/s] of the left and the right wheel."""
+    return [c[v] + side * c[w] * track / 2 for v, w in (("cv", "cw"), ("v", "w")) for side in (-1, 1)]
+
+
+LEGENDS = [
+    "% logfile of robot 7\n%  1    time 0.000 sec\n%  2    mission (0) state 2\n"
+    "%  3  4 Motor velocity ref (m/s) left, right: 0.00 0.00\n%  5  6 Wheel velocity [m/s] left, right: 0.0 0.0\n",
+    "% Drive of\n% wheel base: 0.5 m\n% 0 \tTime (sec)\n% 1 \tmode (0=automatic, 1=manual)\n"
+    "% 2,3 \tDesired wheel velocity left, right (m/s)\n% 4 \tVelocity left (m/s)\n% 5 \tVelocity right (m/s)\n",
+]
+
+
+@pytest.mark.parametrize("legend", LEGENDS)
+def test_comments_that_number_the_columns_give_them_their_names(tmp_path, legend):
+    c = columns()
+    table = np.column_stack([c["t"], np.full(len(c["t"]), 2), *wheel_speeds(c)])
+    path = tmp_path / "drive.txt"
+    path.write_text(legend + "".join(" ".join(f"{one:.5f}" for one in row) + " \n" for row in table))
+    log, _ = convert(ConvertConfig(path, tmp_path / "log", wheel_radius=0.1, track=0.5))
+    check(log.trials[0], pose=False)
+
+
+def test_comments_that_only_begin_with_a_number_name_nothing(tmp_path):
+    path = tmp_path / "drive.txt"
+    path.write_text("% 3 laps of the hall\n% 12 March, wet\n" + "".join(f"{k} {k % 3} 0 0\n" for k in range(20)))
+    assert list(read_table(path).columns) == ["column1", "column2", "column3", "column4"]
+
+
+def test_who_says_which_columns_are_the_wheel_commands_needs_no_word_on_a_set_speed_beside_them(tmp_path):
+    c = columns()
+    names = ("leftCommand", "rightCommand", "leftSpeed", "rightSpeed")
+    sides = dict(zip(names, wheel_speeds(c), strict=True))
+    path = write(tmp_path / "drive.csv", {"time": c["t"], "targetSpeed": np.full(len(c["t"]), 200.0), **sides})
+    said = tuple(f"{role}={name}:m/s" for role, name in zip(
+        ("command.left", "command.right", "wheels.left", "wheels.right"), names, strict=True))
+    log, _ = convert(ConvertConfig(path, tmp_path / "log", columns=said, wheel_radius=0.1, track=0.5))
+    check(log.trials[0], pose=False)

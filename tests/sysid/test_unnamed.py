@@ -23,7 +23,8 @@ from sysid.follow_up.wrench_tables import (
 from sysid.logs.manoeuvre_library import make_command
 from sysid.logs.records import OdometryStream, PoseStream, Start, Trial
 from sysid.missing.catalogue import base_values
-from sysid.missing.unexplained import PHASES, align, wave_turns
+from sysid.missing.unexplained import PHASES, align, best_gain, held_back_gains, wave_turns
+from sysid.pages import loop_report
 from sysid.pages.loop_page import describe_unnamed
 from sysid.pages.loop_page import wrench as wrench_section
 from sysid.replay.models import with_effects
@@ -198,6 +199,26 @@ def test_held_back_gains_of_noise_are_negative():
     random = np.random.default_rng(2)
     columns, residual = random.standard_normal((8, 60, 2 * KNOTS)), random.standard_normal((8, 60))
     assert gains_without(products_of(columns, residual), 1e-3 * np.eye(1 + 2 * KNOTS), 1).sum() < 0
+
+
+@quick
+def test_what_one_drive_alone_leaves_is_not_called_a_function_of_anything():
+    spec, _ = preset("whill_cr_physical")
+    alone, again = (trial_of("straight", 0.0),), (trial_of("straight", 0.0), trial_of("straight", 0.0))
+    left = np.tile(np.sin(np.arange(round(TIME / BIN)) * BIN)[:, None], (1, 5)).reshape(1, -1)
+    assert set(held_back_gains(alone, spec, 5 * left, BIN).values()) == {0.0}
+    assert best_gain(alone, spec, 5 * left, BIN) == 0.0
+    assert best_gain(again, spec, np.concatenate([5 * left, 5 * left]), BIN) > 10
+
+
+@quick
+def test_a_quantity_that_predicts_nothing_is_no_place_where_the_rest_lives(monkeypatch):
+    gains = {"speed": 0.0, "yaw rate": 8.0, "time in the drive": -3.0}
+    monkeypatch.setattr(loop_report, "held_back_gains", lambda *_: gains)
+    found = SimpleNamespace(final=SimpleNamespace(residual=np.ones((2, 50))), excess=(0.5, 1.0))
+    result = SimpleNamespace(search=found, log=SimpleNamespace(training=(), spec=None),
+                             reference=SimpleNamespace(width=BIN, channels=5))
+    assert [one["quantity"] for one in loop_report.where_it_lives(result)] == ["yaw rate"]
 
 
 @quick
