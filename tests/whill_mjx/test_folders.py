@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -172,11 +173,65 @@ def test_a_file_is_replaced_only_while_it_is_as_a_command_wrote_it(tmp_path):
 def test_a_damaged_account_of_files_makes_them_somebodys(tmp_path, content):
     path = tmp_path / "mine.csv"
     path.write_text("mine")
-    (tmp_path / ".written.json").write_bytes(content)
+    (tmp_path / ".mine.csv.written").write_bytes(content)
     with pytest.raises(FolderRefused, match="exists already"):
         check_file("--out", path)
     note_written(path)
     check_file("--out", path)
+
+
+def test_files_that_are_written_at_once_are_all_noted(tmp_path):
+    def write(name):
+        for turn in range(5):
+            check_file("--out", tmp_path / name)
+            write_whole(tmp_path / name, f"{name} {turn}")
+            note_written(tmp_path / name)
+
+    names = [f"{number}.csv" for number in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, names))
+    script = f"""
+import sys
+from pathlib import Path
+from whill_mjx.io.folders import check_file, write_whole
+path = Path({str(tmp_path)!r}) / sys.argv[1]
+check_file("--out", path)
+write_whole(path, sys.argv[1])
+"""
+    processes = [subprocess.Popen([sys.executable, "-c", script, name], cwd=ROOT) for name in ("a.png", "b.png")]
+    assert [one.wait() for one in processes] == [0, 0]
+    for name in (*names, "a.png", "b.png"):
+        check_file("--out", tmp_path / name)
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("there", [True, False])
+def test_a_kill_before_or_after_a_file_gets_its_name_leaves_it_to_the_same_command(tmp_path, there, when):
+    path = tmp_path / "page.html"
+    if there:
+        check_file("--out", path)
+        write_whole(path, "old")
+    killed = f"""
+import os
+from pathlib import Path
+from whill_mjx.io.folders import check_file, write_whole
+replace = os.replace
+def until_the_kill(source, target):
+    if {when == "after"}:
+        replace(source, target)
+    os._exit(7)
+os.replace = until_the_kill
+check_file("--out", Path({str(path)!r}))
+write_whole(Path({str(path)!r}), "new")
+"""
+    assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == 7
+    found = path.read_text() if path.exists() else None
+    assert found == ("new" if when == "after" else "old" if there else None)
+    check_file("--out", path)
+    if found:
+        path.write_text("edited")
+        with pytest.raises(FolderRefused, match="or its note .page.html.written was lost"):
+            check_file("--out", path)
 
 
 def test_what_is_no_file_is_not_replaced(tmp_path):

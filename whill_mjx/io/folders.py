@@ -26,8 +26,9 @@ from whill_mjx.io.reading import read_json
 RUN_FILE = "run.json"
 """Kind and identity of what a folder holds, written once."""
 LOCK_FILE = ".lock"
-WRITTEN_FILE = ".written.json"
-"""Checksum of each single file that a command wrote into a folder: one that is still so may be replaced."""
+NOTE = ".{}.written"
+"""Name of the note of a single file: a line for each content that a command gave it. While it has one of them, it may
+be replaced. Lines are only appended, so that processes that write at once keep each other's."""
 SHOWN = 6
 """Differences between two runs that an error names."""
 LEAST_FREE = 4_000_000
@@ -35,6 +36,9 @@ LEAST_FREE = 4_000_000
 RESULTS = ("report.html", "report.json", "vehicle.toml", "dataset.toml", "policy.json", "policy", "evaluation.json",
            "metrics.jsonl", "checkpoints", "trials")  # fmt: skip
 """Names of results of this project's commands: a folder that has one belongs to somebody."""
+
+_checked: set[Path] = set()
+"""Files that this process may replace: their notes are made before they get their names."""
 
 
 class FolderRefused(OptionError):
@@ -45,7 +49,8 @@ class FolderRefused(OptionError):
 def whole_file(path: Path) -> Iterator[Path]:
     """A path to write, of the same ending, that becomes `path` when the block ends well and vanishes otherwise.
 
-    An OSError of the block names `path`.
+    A file that `check_file` has let pass is noted before it gets its name: a kill in between leaves both in order. An
+    OSError of the block names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
@@ -53,6 +58,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
+        if path.absolute() in _checked:
+            _note(path, _checksum(temporary))
         with WRITING:
             os.replace(temporary, path)
     except BaseException as error:
@@ -73,33 +80,44 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def check_file(option: str, path: Path, instead: str = "choose another name") -> None:
-    """Raise FolderRefused where a file cannot be written at `path`, or is there and not as `note_written` knows it.
+    """Raise FolderRefused where a file cannot be written at `path`, or is there and not as a command wrote it.
 
     `instead`: what the caller may do about a file that is not replaced.
     """
     check_place(option, path)
     if path.is_dir():
         raise FolderRefused(f"{option} {path}: is a folder. Give the name of a file.")
-    if path.exists() and (not path.is_file() or _written(path.parent).get(path.name) != _checksum(path)):
+    if path.exists() and not (path.is_file() and _is_noted(path)):
         raise FolderRefused(f"{option} {path}: exists already, and is not as a command of this project wrote it (or an "
-                            f"earlier version did). It is not replaced: {instead}, or remove it.")
+                            f"earlier version did, or its note {NOTE.format(path.name)} was lost). It is not replaced: "
+                            f"{instead}, or remove it.")
+    _checked.add(path.absolute())
 
 
 def note_written(*paths: Path) -> None:
-    """Remember files that were written, so that the same command may replace them while nobody has changed them."""
+    """Remember files that were written, so that the same command may replace them while nobody has changed them.
+
+    Only a file that was not written by `whole_file` after `check_file` needs this.
+    """
     for path in paths:
-        with suppress(OSError):
-            write_whole(path.parent / WRITTEN_FILE, json.dumps(
-                {**_written(path.parent), path.name: _checksum(path)}, indent=1) + "\n")
+        _note(path, _checksum(path))
 
 
-def _written(folder: Path) -> dict[str, Any]:
-    """Name -> checksum of the files in a folder that commands wrote; empty where this cannot be read."""
+def _note(path: Path, checksum: str) -> None:
+    """Note a content of a file; where this cannot be written, the file counts as somebody's."""
+    with suppress(OSError):
+        note = path.with_name(NOTE.format(path.name))
+        if not note.exists() or checksum.encode() not in note.read_bytes():
+            with note.open("ab") as file:
+                file.write(f"{checksum}\n".encode())
+
+
+def _is_noted(path: Path) -> bool:
+    """Whether a file has a content that a command gave it."""
     try:
-        found = read_json(folder / WRITTEN_FILE, "missing.", "")
-    except (ValueError, OSError):
-        return {}
-    return found if isinstance(found, dict) else {}
+        return _checksum(path).encode() in path.with_name(NOTE.format(path.name)).read_bytes()
+    except OSError:
+        return False
 
 
 def _checksum(path: Path) -> str:
