@@ -22,6 +22,7 @@ from benchmarks.plant.chair import VEHICLES
 from bridge.options import Parser
 from bridge.trial_writer import COLUMNS
 from whill_mjx.io.command_line import guarded
+from whill_mjx.io.folders import check_file
 
 COMMANDS = "t,v,omega\n0,0,0\n1,0.2,0\n6,0,0\n8,0,0.3\n12,0,0\n14,0,0\n"
 GAP = 0.15
@@ -76,14 +77,18 @@ def main() -> None:
     matplotlib.use("Agg")
     parser = Parser(prog="python -m benchmarks.deploy_plots", description=__doc__)
     parser.add_argument("trial", nargs="?", type=Path, help="folder of a recorded trial")
-    parser.add_argument("--out", type=Path, default=IMAGES / "first_drive.png", help="PNG file")
+    parser.add_argument("--out", type=Path, help="PNG file (default: first_drive.png here; without a recording the "
+                        "picture of docs/deploy.md)")
     given = parser.parse_args()
+    out = given.out or (Path("first_drive.png") if given.trial else IMAGES / "first_drive.png")
     with tempfile.TemporaryDirectory() as folder:
         try:
+            if given.out or given.trial:  # the page's own picture is kept by git
+                check_file("--out", out)
             figure = draw(given.trial or expected(Path(folder)))
         except ValueError as error:
             parser.error(str(error))
-    save_figure(figure, given.out)
+    save_figure(figure, out)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from benchmarks.pictures import IMAGES, write_film
 from benchmarks.task_pages import worlds
 from bridge.options import Parser
 from whill_mjx.io.command_line import guarded
+from whill_mjx.io.folders import whole_file
 from whill_mjx.tasks.options import named_task
 
 WIDEST = 1100
@@ -31,10 +32,9 @@ def save_figure(figure: Any, out: Path) -> None:
     """Write a matplotlib figure as PNG, whole or not at all."""
     import matplotlib.pyplot as plt
 
-    temporary = out.with_name(f".{out.name}")
-    figure.savefig(temporary, dpi=110, format="png", pil_kwargs={"optimize": True})
+    with whole_file(out) as temporary:
+        figure.savefig(temporary, dpi=110, format="png", pil_kwargs={"optimize": True})
     plt.close(figure)
-    temporary.replace(out)
     print(f"{out}: {out.stat().st_size / 1e3:.0f} kB")
 
 

@@ -69,7 +69,8 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--require-arm", action="store_true", help="stand until a first message on bridge/rearm")
     parser.add_argument("--lifecycle", action="store_true",
                         help="be a lifecycle node, which stands until it is configured and activated")
-    parser.add_argument("--results", type=result_file, help="JSON file for the counts of the drive, written at its end")
+    parser.add_argument("--results", type=result_file("counts", "reason"),
+                        help="JSON file for the counts of the drive, written at its end")
     add_options(parser)
     options = parser.parse_intermixed_args(arguments)
     options.policy = options.policy[-1]  # the first ones come from parameter files

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import re
@@ -98,14 +99,34 @@ def said(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-def result_file(text: str) -> Path:
-    """A type for `add_argument`: a file that is written in the end, in a folder that exists."""
-    path = Path(text)
-    if path.is_dir():
-        raise argparse.ArgumentTypeError(f"{text} is a folder. Give the name of a file")
-    if not os.access(path.absolute().parent, os.W_OK | os.X_OK):
-        raise argparse.ArgumentTypeError(f"{text}: its folder is missing or cannot be written. Choose another place")
-    return path
+def result_file(*keys: str) -> Callable[[str], Path]:
+    """A type for `add_argument`: a JSON file that is written in the end, in a folder that exists.
+
+    A file that is there is replaced only where it is an earlier one of its kind: an object with these keys and no more.
+    """
+
+    def read(text: str) -> Path:
+        path = Path(text)
+        if path.is_dir():
+            raise argparse.ArgumentTypeError(f"{text} is a folder. Give the name of a file")
+        if not os.access(path.absolute().parent, os.W_OK | os.X_OK):
+            raise argparse.ArgumentTypeError(f"{text}: its folder is missing or cannot be written. Choose another "
+                                             "place")
+        if path.exists() and not _is_result(path, keys):
+            raise argparse.ArgumentTypeError(f"{text}: exists already, and is no earlier result of this command "
+                                             f"({', '.join(keys)}). Choose another name, or remove it")
+        return path
+
+    return read
+
+
+def _is_result(path: Path, keys: tuple[str, ...]) -> bool:
+    """Return whether a file holds a JSON object with these keys and no others."""
+    try:
+        found = json.loads(path.read_bytes()) if path.is_file() else None
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(found, dict) and set(found) == set(keys)
 
 
 def whole(low: int = 1, high: int = 1_000_000_000) -> Callable[[str], float]:

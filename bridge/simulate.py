@@ -28,7 +28,7 @@ from bridge.episodes import EpisodeServer
 from bridge.exits import Exit, OptionError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
 from bridge.policy import PolicyFileError, pacer_of
-from bridge.simulate_node import SimulateNode
+from bridge.simulate_node import RESULTS, SimulateNode
 from bridge.simulated import SCAN_HEIGHT, SCAN_RANGE, SCAN_RAYS, Frame, Grid, SimulatedVehicle
 
 SIMULATOR = "bridge.simulate:ChairSimulator"
@@ -324,7 +324,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--wait", type=in_range(0), default=10.0,
                         help="wait this long for a driver before the first episode [s]")
     parser.add_argument("--linger", type=in_range(0), default=1.0, help="listen this long after the last episode [s]")
-    parser.add_argument("--results", type=result_file, help="JSON file for the outcome of the episodes")
+    parser.add_argument("--results", type=result_file(*RESULTS), help="JSON file for the outcome of the episodes")
     parser.add_argument("--image-size", type=whole(1, 10_000), nargs=2, metavar=("HEIGHT", "WIDTH"),
                         help="enlarge the camera image")
     parser.add_argument("--clock", action="store_true", help="publish the simulated time on /clock and stamp with it")

@@ -31,6 +31,8 @@ LOG_LENGTH = 100_000
 """Commands and delays that are kept for the results file."""
 COMMAND_EXPIRY = 0.2
 """The chair's controller forgets a command after this time [s]."""
+RESULTS = ("episodes", "image_times", "commands", "stops_at_end", "frame_to_command")
+"""Keys of the results file."""
 
 
 class SimulateNode:

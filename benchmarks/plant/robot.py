@@ -157,7 +157,8 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=whole(0), default=0, help="of the day, its disturbances and its sensors' noise")
     parser.add_argument("--draw", type=whole(0), help="build in one effect, drawn by this number; default: none")
     parser.add_argument("--effect", choices=sorted(EFFECTS), help="which effect, instead of a drawn one")
-    parser.add_argument("--answers", type=result_file, help="JSON file for the effect; keep it away from the drives")
+    parser.add_argument("--answers", type=result_file("effects", "seed"),
+                        help="JSON file for the effect; keep it away from the drives")
     parser.add_argument("--noise", type=in_range(0, 100), default=1.0, help="factor on disturbances and sensor noise")
     parser.add_argument("--speed", type=in_range(0.01, 1000), default=1.0, help="simulated seconds per second at most")
     return parser.parse_args(arguments)
