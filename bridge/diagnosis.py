@@ -5,6 +5,7 @@ A cause is computed from what is so now: it disappears with what caused it.
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -158,13 +159,13 @@ def input_cause(name: str, topic: str, kind: str, publishers: list[Endpoint], st
         stream: what came.
         now: steady time [s].
     """
+    if len(fitting(publishers, kind)) > 1:  # it holds the vehicle, whatever else is sent there
+        return _mixed(topic, fitting(publishers, kind), "messages")
     wrong = sorted({one.type for one in publishers} - {kind})
     if wrong:
         return f"{topic} carries {', '.join(wrong)}, and the policy's {name} is a {kind}: remap it to the right topic"
     if not publishers:
         return f"no publisher on {topic}, the policy's {name}: start the {stream.sensor.kind}, or remap the topic"
-    if len(publishers) > 1:  # all are of the right kind
-        return _mixed(topic, publishers, "messages")
     if now - stream.received <= SILENT and stream.unusable:
         return f"{topic}: {stream.unusable}"
     if stream.is_silent(now):
@@ -180,6 +181,11 @@ def input_cause(name: str, topic: str, kind: str, publishers: list[Endpoint], st
 def fitting(publishers: list[Endpoint], kind: str) -> list[Endpoint]:
     """Return the publishers whose messages are read; those of more than one mix."""
     return [one for one in publishers if one.type == kind]
+
+
+def is_mixed(publishers: Mapping[str, list[Endpoint]], kinds: Mapping[str, str]) -> bool:
+    """Return whether messages of two publishers are read as one input; both mappings are by the input's name."""
+    return any(len(fitting(publishers[name], kind)) > 1 for name, kind in kinds.items())
 
 
 def _mixed(topic: str, publishers: list[Endpoint], what: str) -> str:

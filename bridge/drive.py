@@ -18,7 +18,7 @@ from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.commands import Endpoint, endpoints
 from bridge.controller import Caution, Controller
-from bridge.diagnosis import Evidence, FrameLog, causes, fitting, input_cause
+from bridge.diagnosis import Evidence, FrameLog, causes, input_cause, is_mixed
 from bridge.exits import Exit, OptionError, refusal
 from bridge.image import ImageError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
@@ -140,8 +140,8 @@ class DriveNode(VehicleNode):
         """Look at the graph, also for who sends the policy's inputs: it does not drive on a mixture of two sources."""
         self._publishers = {name: endpoints(self.node.get_publishers_info_by_topic(topic.topic))
                             for name, topic in self._topics.items()}
-        self.supervisor.block(MIXED, any(len(fitting(self._publishers[name], topic.full_kind)) > 1
-                                         for name, topic in self._topics.items()))
+        kinds = {name: topic.full_kind for name, topic in self._topics.items()}
+        self.supervisor.block(MIXED, is_mixed(self._publishers, kinds))
         super()._on_look()
 
     def causes(self) -> list[str]:

@@ -5,7 +5,10 @@ import dataclasses
 import pytest
 
 from bridge.commands import Endpoint
-from bridge.diagnosis import Evidence, FrameLog, causes
+from bridge.diagnosis import Evidence, FrameLog, causes, input_cause, is_mixed
+from bridge.policy import SensorInput
+from bridge.sense_topics import topics_of
+from bridge.senses import Stream
 
 pytestmark = pytest.mark.quick
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -99,3 +102,49 @@ def test_cause_is_gone_when_the_window_has_passed():
     log = frames(lost=3)
     log.trim(105.0)
     assert log.losses == 0 and log.count == 0
+
+
+SENSORS = {"camera": SensorInput("camera", "camera", (8, 8, 3)), "lidar": SensorInput("lidar", "lidar", (4,)),
+           "odometry": SensorInput("odometry", "odometry", (5,))}
+KINDS = {name: topic.full_kind for name, topic in topics_of(SENSORS).items()}
+OTHER = "std_msgs/msg/String"
+
+
+def publishers(**more):
+    """One publisher of each input, and more of those that are named."""
+    return {name: [Endpoint("/robot", kind), *more.get(name, [])] for name, kind in KINDS.items()}
+
+
+def cause_of(name, found):
+    return input_cause(name, f"/{name}", KINDS[name], found[name], Stream(SENSORS[name], 0.5, 0.3), 100.0)
+
+
+def test_one_publisher_of_each_input_drives():
+    assert not is_mixed(publishers(), KINDS) and not is_mixed(dict.fromkeys(KINDS, []), KINDS)
+
+
+@pytest.mark.parametrize("name", ["lidar", "odometry"])
+@pytest.mark.parametrize("node", ["/second", "/robot"])
+@pytest.mark.parametrize("third", [[], [Endpoint("/third", OTHER)]])
+def test_two_publishers_of_an_input_hold_and_are_named_whatever_else_is_sent_there(name, node, third):
+    found = publishers(**{name: [Endpoint(node, KINDS[name]), *third]})
+    assert is_mixed(found, KINDS)
+    assert f"2 publishers (/robot, {node}): their messages mix" in cause_of(name, found)
+
+
+@pytest.mark.parametrize("name", ["lidar", "odometry"])
+def test_a_publisher_of_a_wrong_type_is_named_and_holds_nothing(name):
+    found = publishers(**{name: [Endpoint("/second", OTHER)]})
+    assert not is_mixed(found, KINDS)
+    assert f"carries {OTHER}" in cause_of(name, found)
+
+
+@pytest.mark.parametrize("kind, other", [(IMAGE, COMPRESSED), (COMPRESSED, IMAGE)])
+@pytest.mark.parametrize("node", ["/second", "/camera"])
+def test_two_cameras_hold_where_both_send_what_is_read(kind, other, node):
+    first, third = Endpoint("/camera", kind), Endpoint("/third", other)
+    for more, held in (([Endpoint(node, kind)], True), ([Endpoint(node, kind), third], True), ([third], False)):
+        cameras = [first, *more]
+        assert is_mixed({"camera": cameras}, {"camera": kind}) is held
+        said = f"2 publishers (/camera, {node}): their images mix" in " ".join(found(cameras=cameras, image_type=kind))
+        assert said is held
