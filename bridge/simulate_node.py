@@ -48,7 +48,6 @@ class SimulateNode:
         log.info("compiling the simulator: up to a minute where it has not run before")
         vehicle.reset(options.seed)
         vehicle.step(0.0, 0.0)  # compiles, where the simulator does; before anybody waits for frames
-        log.info(f"ready; commands are heard on {node.resolve_topic_name(ros.COMMAND_TOPIC)}")
         self.node, self.vehicle, self.options = node, vehicle, options
         self.clock = SimulatedClock(options.speed, options.clock)
         self._bool, self._header = Bool, Header
@@ -83,6 +82,7 @@ class SimulateNode:
         self._next: Frame | None = None
         self.finished_at: float | None = None
         ros.steady_timer(node, vehicle.period / 2 / options.speed, self._on_half_period)
+        log.info(f"ready; commands are heard on {node.resolve_topic_name(ros.COMMAND_TOPIC)}")
 
     def finished(self) -> bool:
         """Return whether all episodes are over, and the time to linger has passed."""

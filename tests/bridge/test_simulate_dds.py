@@ -3,12 +3,15 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import yaml
 
 from benchmarks.bridge_robot import message_type
+from bridge.simulate_node import SimulateNode
 from bridge.simulated import SimulatedClock
 from bridge.simulated_messages import between, planar_covariance
 
@@ -179,3 +182,19 @@ def test_simulator_says_when_it_is_ready_where_it_listens_and_how_an_episode_end
     log = graph.log("simulate")
     assert log.index("ready; commands are heard on /whill/controller/cmd_vel") < log.index(
         "episode 1: neither arrived nor collided after 10 steps and 0 commands")
+
+
+@pytest.mark.quick
+def test_the_simulator_says_that_it_is_ready_when_its_topics_are_there(monkeypatch):
+    pytest.importorskip("rclpy")
+    calls = MagicMock()
+    monkeypatch.setattr("bridge.simulate_node.ros", calls.ros)
+    calls.node.resolve_topic_name.return_value = "/cmd_vel"
+    vehicle = SimpleNamespace(period=0.1, reset=lambda seed: None, step=lambda v, omega: None)
+    options = SimpleNamespace(seed=0, speed=1.0, clock=True, command_type="Twist")
+    SimulateNode(calls.node, vehicle, options)
+    words = [str(call) for call in calls.mock_calls]
+    [ready] = [number for number, word in enumerate(words) if "ready; commands are heard on /cmd_vel" in word]
+    made = [number for number, word in enumerate(words)
+            if word.startswith(("call.node.create_", "call.ros.subscribe_state(", "call.ros.steady_timer("))]
+    assert len(made) > 8 and max(made) < ready
