@@ -122,9 +122,14 @@ def ready_robot(config: Benchmark, loop: LoopConfig) -> tuple[Prepared, VehicleS
     return ready, spec, fitted
 
 
+def names_of(config: Benchmark) -> tuple[str, ...]:
+    """Names of all logs."""
+    return (*TESTED, *(f"null_{k + 1}" for k in range(config.nulls)))
+
+
 def judge(config: Benchmark) -> None:
     """Keep the verdict on each log of this part."""
-    names = (*TESTED, *(f"null_{k + 1}" for k in range(config.nulls)))
+    names = names_of(config)
     mine = [name for name in labels_of(config.part, names) if not config.only or name in config.only]
     loop = LoopConfig(quick=config.quick)
     ready, spec, fitted = ready_robot(config, loop)
@@ -143,8 +148,20 @@ def judge(config: Benchmark) -> None:
 
 
 def collect(config: Benchmark) -> dict[str, Any]:
-    """Figures of all verdicts: right is a log whose effect is in the class of one that was named, and no other."""
-    verdicts = read_results(config.out / "verdicts")
+    """Figures of all verdicts: right is a log whose effect is in the class of one that was named, and no other.
+
+    Raises:
+        ValueError: a log has no verdict. Without it the score would be of the others alone.
+    """
+    folder = config.out / "verdicts"
+    names = [name for name in names_of(config) if not config.only or name in config.only]
+    verdicts = [one for one in read_results(folder) if one["label"] in names]
+    judged = {one["label"] for one in verdicts}
+    left = [f"{name} ({'failed' if (folder / f'{name}.json').exists() else 'missing'})"
+            for name in names if name not in judged]
+    if left:
+        raise ValueError(f"{folder}: no verdict on {', '.join(left)}. Remove the files of those that failed, and "
+                         "run their parts again.")
     right, false = [], []
     for one in verdicts:
         if one["effect"] in EFFECTS:
