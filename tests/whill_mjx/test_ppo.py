@@ -237,6 +237,35 @@ def test_the_exported_step_remembers_what_the_network_was_trained_on(config):
         np.testing.assert_allclose(action, expected, atol=1e-5)
 
 
+def test_the_exported_network_of_several_readings_drives_through_the_bridge_like_the_trained_one(tmp_path):
+    """Two episodes: the second begins with its own first readings, whatever the first one ended with."""
+    from bridge.policy import Policy
+    from dreamer.export import PolicyContract, SensingPolicy, export_sensing
+
+    empty = empty_frames(SENSING, SHAPES, (1,))
+    params = Network(SENSING, 2).init(jax.random.key(0), empty)
+    params["params"]["Dense_1"]["kernel"] *= 1e2  # a new network's actions are all near zero
+
+    def step(carry, obs):
+        return policy_step(SENSING, params, carry, obs)
+
+    sensors = {"camera": {"kind": "camera"}, "goal": {"kind": "goal"}, "lidar": {"kind": "lidar"}}
+    exported = SensingPolicy(step, policy_carry(SENSING, SHAPES), SHAPES, params, sensors)
+    policy = Policy.load(export_sensing(tmp_path / "policy", exported, PolicyContract((0.0, -0.6), (0.3, 0.6))))
+    assert set(policy.sensors) == set(SHAPES)
+    rng, commands = np.random.default_rng(0), []
+    for _ in range(2):
+        policy.reset()
+        frames = empty
+        for count in range(SENSING.readings + 2):
+            obs = sensed(rng, 1)
+            frames = push(frames, obs, jnp.array([count == 0]))
+            expected = np.clip(Network(SENSING, 2).apply(params, frames)[0][0], -1.0, 1.0)
+            commands.append(policy.step({name: value[0] for name, value in obs.items()}))
+            np.testing.assert_allclose(commands[-1], [0.15 * (expected[0] + 1.0), 0.6 * expected[1]], atol=1e-4)
+    assert np.ptp(commands, axis=0).max() > 0.05
+
+
 @pytest.mark.quick
 def test_scans_of_several_lengths_are_refused():
     with pytest.raises(ValueError, match="one length"):
