@@ -2,7 +2,7 @@
 
 PPO trains for some minutes on two recordings of one office and on made floor plans, once for each of the runs, and then
 drives in two other buildings, with its senses and without. The maps are those of ../shared/data/maps. A run that is
-there is not made again, so the same command goes on after an interruption.
+there is not made again, so the same command goes on after an interruption. Runs of other options are refused.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +25,7 @@ from benchmarks.harness import RESULTS, device_name, figure, provenance, record
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, episode_keys
 from whill_mjx.io.command_line import COUNT, SEED, OptionError, Range, run
-from whill_mjx.io.folders import write_whole
+from whill_mjx.io.folders import claim_folder, write_whole
 from whill_mjx.learning import ppo
 from whill_mjx.learning.options import TrainOptions, choose_preset
 from whill_mjx.learning.outcome import export
@@ -43,6 +45,8 @@ from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 from whill_mjx.world.maps import make_map_scene, read_map
 from whill_mjx.world.maps.several import side_by_side
 
+KIND = "benchmarks.among"
+OUTPUTS = ("result.json", "training.json", "weights.msgpack")
 CLAIM = "Obstacle course with physics, camera image, reward and auto-reset"
 TRAINED = ("fetch_office/3_1_16_localization.yaml", "fetch_office/9_16_15.yaml")
 UNSEEN = ("stata_basement/stata_basement.yaml", "willow_garage/willow-full.yaml")
@@ -197,13 +201,28 @@ def _map_of(options: Options, x: np.ndarray) -> np.ndarray:
     return np.searchsorted(firsts, x, side="right") - 1
 
 
+@contextmanager
+def held_run(options: Options, senses: str, seed: int) -> Iterator[Path]:
+    """Hold the folder of a run until the block ends; FolderRefused where it was trained or judged by other options."""
+    folder = options.out / f"{senses}_{seed}"
+    asked = dataclasses.asdict(options)
+    identity = {name: asked[name] for name in asked if name not in ("runs", "out", "results")}
+    with claim_folder(folder, KIND, OUTPUTS) as claim:
+        claim.settle(identity, (folder / "training.json").exists())
+        yield folder
+
+
 def one_run(options: Options, senses: str, seed: int) -> dict[str, Any]:
     """Train and judge one policy, or read what is there."""
-    folder = options.out / f"{senses}_{seed}"
+    with held_run(options, senses, seed) as folder:
+        return made_run(options, senses, seed, folder)
+
+
+def made_run(options: Options, senses: str, seed: int, folder: Path) -> dict[str, Any]:
+    """Result of a run whose folder this process holds: what it lacks is made."""
     path = folder / "result.json"
     if path.exists():
-        return json.loads(path.read_text())
-    folder.mkdir(parents=True, exist_ok=True)
+        return dict(json.loads(path.read_text()))
     _, preset = preset_of(options, senses, seed, folder)
     save_vehicle(folder / "vehicle.toml", *load_vehicle(VEHICLE)[:2])
     took_path = folder / "training.json"
@@ -274,6 +293,9 @@ def main(options: Options) -> None:
         if senses not in SENSES or not seed.isdecimal():
             raise OptionError(f"--runs {text}: give SENSES:SEED with senses of {', '.join(SENSES)}, such as lidar:0.")
         runs.append((senses, int(seed)))
+    for senses, number in runs:
+        with held_run(options, senses, number):
+            pass  # before the first training, so that none is in vain
     results = []
     for senses, number in runs:
         print(f"{senses}, seed {number}", flush=True)

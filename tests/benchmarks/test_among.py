@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
 
 from benchmarks import among
 from whill_mjx.io.command_line import OptionError
+from whill_mjx.io.folders import FolderRefused
 
 TINY = dict(trained=("made:0",), made=0, unseen=("made:7", "made:8"), minutes=0.01, instances=2, episodes=4,
             set=("people=2", "max_steps=20"),
@@ -32,6 +34,22 @@ def test_a_run_is_trained_judged_and_not_made_again(tmp_path):
     among.main(options)
     figures = json.loads((tmp_path / "results" / "environment.json").read_text())["figures"]
     assert figures["among_lidar_arrived"]["value"] == 0.625
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name, value", [
+    ("minutes", 0.02), ("instances", 4), ("trained", ("made:1",)), ("unseen", ("made:7",)), ("episodes", 8),
+    ("set", ()), ("change", ()), ("made", 1), ("seed", 5)])
+def test_a_run_of_other_options_is_refused_before_any_training(tmp_path, monkeypatch, name, value):
+    monkeypatch.setattr(among, "train", lambda *given: pytest.fail("trained"))
+    options = among.Options(runs=("lidar:0",), out=tmp_path, results=tmp_path / "results", **TINY)
+    with among.held_run(options, "lidar", 0) as folder:
+        (folder / "training.json").write_text("{}")
+    asked = dataclasses.replace(options, runs=("both:0", "lidar:0"), **{name: value})
+    with pytest.raises(FolderRefused, match=f"lidar_0: holds another run: {name} is"):
+        among.main(asked)
+    with among.held_run(dataclasses.replace(options, runs=(), results=tmp_path), "lidar", 0):
+        pass  # where figures go and which runs are made changes no result
 
 
 def test_a_run_is_named_by_senses_and_seed(tmp_path):
