@@ -1,4 +1,4 @@
-"""Types of the command-line options of the bridge."""
+"""Result files of the bridge: an option names one, and one of somebody is not replaced."""
 
 from __future__ import annotations
 
