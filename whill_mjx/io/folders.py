@@ -100,7 +100,8 @@ def note_written(*paths: Path) -> None:
     Only a file that was not written by `whole_file` after `check_file` needs this.
     """
     for path in paths:
-        _note(path, _checksum(path))
+        with suppress(OSError):  # a file that is gone again
+            _note(path, _checksum(path))
 
 
 def _note(path: Path, checksum: str) -> None:
