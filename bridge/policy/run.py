@@ -81,7 +81,10 @@ def make_session(policy: CheckedPolicy) -> Any:
     options.intra_op_num_threads = 1  # one thread has the lower tail latency on a vehicle's shared cores
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    return onnxruntime.InferenceSession(policy.network, options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(policy.network, options, providers=["CPUExecutionProvider"])
+    session.disable_fallback()
+    vars(session).pop("_model_bytes", None)  # it keeps the whole file to build itself again for a fallback
+    return session
 
 
 class Policy:
