@@ -9,7 +9,8 @@ Damaged files and mistaken commands are those of the tests, more of them. Kills 
 start them, at random moments. A run is lost work where it computed for more than a minute since its newest step,
 different where its results are not those of a run left alone, and half written where a file with its final name cannot
 be read. The run left alone is watched: the longest time in which it saves nothing is the most that any kill can cost.
-Both are processor time, which does not depend on what else the computer does.
+Both are processor time, which does not depend on what else the computer does. Compiled programs are saves too: the next
+run reads them from the user's cache, which is empty before the first run here.
 
 What was measured is kept in --keep: a benchmark that is stopped goes on there. Figures are those of all rooms, commands
 and seeds that it holds, each with its commit, so parts may run side by side on machines of one kind. Work divides by
@@ -21,6 +22,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import random
@@ -31,7 +33,7 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -156,13 +158,15 @@ def mistaken_commands() -> Figures:
 
 
 class Started(subprocess.Popen[str]):
-    """A command at work in a folder."""
+    """A command at work in a folder, with a user's cache beside it."""
 
     def __init__(self, words: list[str], out: Path):
         path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         self._said = tempfile.TemporaryFile("w+")
+        self.saves = (out, out.parent / "cache")
+        environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(self.saves[1].absolute())}
         super().__init__([sys.executable, "-m", *words, "--out", str(out)], cwd=ROOT, text=True,
-                         stdout=subprocess.DEVNULL, stderr=self._said, env={**os.environ, "PYTHONPATH": path})
+                         stdout=subprocess.DEVNULL, stderr=self._said, env=environment)
 
     def said(self) -> str:
         """Wait for the end; what it wrote to stderr."""
@@ -186,10 +190,10 @@ def half_written(out: Path) -> list[Path]:
     return broken
 
 
-def newest(out: Path) -> float:
-    """When a run last saved what it goes on from, or a result; 0 where it never did."""
+def newest(folders: Iterable[Path]) -> float:
+    """When a run last saved what it goes on from, or a result, in these folders; 0 where it never did."""
     times = [0.0]
-    for path in out.rglob("*"):
+    for path in itertools.chain.from_iterable(folder.rglob("*") for folder in folders):
         if path.name not in NO_SAVES and path.suffix != ".jsonl":
             with contextlib.suppress(FileNotFoundError):  # removed meanwhile
                 times.append(path.stat().st_mtime)
@@ -199,16 +203,16 @@ def newest(out: Path) -> float:
 class Watch:
     """How long a run computes without saving anything [s of processor time]."""
 
-    def __init__(self, child: Started, out: Path):
-        self._child, self._out = child, out
-        self._saved_at, self._used, self.longest = newest(out), 0.0, 0.0
+    def __init__(self, child: Started):
+        self._child = child
+        self._saved_at, self._used, self.longest = newest(child.saves), 0.0, 0.0
 
     def unsaved(self) -> float:
         """Since the newest step; to be asked often."""
         with contextlib.suppress(FileNotFoundError, IndexError):  # it has ended
             words = Path(f"/proc/{self._child.pid}/stat").read_text().rpartition(")")[2].split()
             used = sum(map(int, words[11:15])) / os.sysconf("SC_CLK_TCK")
-            if (saved_at := newest(self._out)) > self._saved_at:
+            if (saved_at := newest(self._child.saves)) > self._saved_at:
                 self._saved_at, self._used = saved_at, used
             self.longest = max(self.longest, used - self._used)
             return used - self._used
@@ -220,7 +224,7 @@ def left_alone(name: str, words: list[str], kept: Kept) -> None:
     out = kept.runs / f"{name}_left"
     shutil.rmtree(out, ignore_errors=True)
     began, child = time.time(), Started(words, out)
-    watch = Watch(child, out)
+    watch = Watch(child)
     while child.poll() is None:
         time.sleep(0.2)
         watch.unsaved()
@@ -243,7 +247,7 @@ def kill_once(name: str, words: list[str], out: Path, found: dict[str, Any], lon
     number = SIGNALS[found["kills"] % len(SIGNALS)]
     chosen = random.Random(f"{found['seed']} {found['kills']} {len(found['bits'])}")
     child, until = Started(words, out), time.monotonic() + chosen.uniform(1.0, longest)
-    watch = Watch(child, out)
+    watch = Watch(child)
     while child.poll() is None and time.monotonic() < until:
         time.sleep(0.2)
         watch.unsaved()
