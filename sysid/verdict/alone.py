@@ -7,9 +7,10 @@ interval of its gain there lies above 0. Effects are added one after the other a
 predict these blocks as well as the best, the one with the fewest parameters is named.
 
 Where there is no odometry either, nothing shows whether wheels fell short of the command or the vehicle of its wheels,
-while all base parameters of drive and tyres are free. Effects of those have no name then: a dead zone, a limit of
-acceleration and drag bend to the same few speeds. The one that predicts best stays in the fit without a name, and what
-still stands out beside it may have one.
+while all base parameters of drive and tyres are free. Effects of those have no name of their own then: a dead zone, a
+limit of acceleration and drag bend to the same few speeds. Where a pose shows another effect that these drives do not
+separate from the best one, and that one predicts the blocks too, it is named, with the best one in its class. Otherwise
+the best one stays in the fit without a name, and what still stands out beside it may have one.
 """
 
 from __future__ import annotations
@@ -58,7 +59,11 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
             break
         best, most = max(standing, key=lambda one: float(one[1].sum()))
         as_good = [one for one, gains in standing if one is best or interval_of_sum(most - gains)[0] <= 0]
-        shown = [one for one in as_good if wheels or card_of(one.hypothesis.effect).shown_by_pose]
+        alike = class_of(asked, best, candidates)
+        shown = as_good if wheels else [
+            one for one in candidates
+            if card_of(one.hypothesis.effect).shown_by_pose and (one in as_good or one.hypothesis.effect in alike)
+            and interval_of_sum(held_back(asked, one.refit))[0] > 0]
         if not shown:
             unseen = unseen or best.hypothesis.effect
             hidden += best.share - asked.explained(found.final)  # what has no name is no part of what names explain
@@ -66,7 +71,7 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
             continue
         taken_on = min(shown, key=lambda one: len(one.hypothesis.axes))
         mine = taken_on.hypothesis.effect
-        members = [*(one.hypothesis.effect for one in as_good), *class_of(asked, best, candidates)]
+        members = [*(one.hypothesis.effect for one in as_good), *alike]
         found.accepted.append(taken_on)
         taken = {one.hypothesis.effect for one in found.accepted}
         found.classes.append([mine, *(name for name in dict.fromkeys(members) if name not in taken)][:LARGEST])

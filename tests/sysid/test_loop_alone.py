@@ -163,9 +163,30 @@ def test_what_stands_beside_an_effect_without_a_name_has_one():
     ([(9.0, -11.0, 10.0), (3.0, 4.0, 5.0), (2.0, 2.0, 2.0)], "command_delay"),  # wrong about a block
 ])
 def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(monkeypatch, gains, result):
+    found = weighed(monkeypatch, gains, lambda asked, best, _: [best.hypothesis.effect])
+    assert named(found) == ("named", [result])
+    assert ("acceleration_limit" in found.classes[0]) == (gains[0][1] > 0)
+
+
+@pytest.mark.parametrize(("foretold", "result"), [
+    ((3.0, 4.0, 5.0), ("named", ["command_delay"])),
+    ((3.0, -4.0, 5.0), ("unexplained", [])),  # wrong about a block
+])
+def test_where_wheels_were_not_seen_what_a_pose_shows_is_named_with_the_best_one_in_its_class(
+        monkeypatch, foretold, result):
+    gains = [(9.0, 11.0, 10.0), foretold, (2.0, -9.0, 2.0)]
+    found = weighed(monkeypatch, gains, lambda *_: ["acceleration_limit", "command_delay"], wheels=False)
+    assert named(found) == result
+    assert found.classes == ([["command_delay", "acceleration_limit"]] if found.accepted else [])
+    apart = weighed(monkeypatch, gains, lambda *_: ["acceleration_limit"], wheels=False)
+    assert apart.verdict == "unexplained" and "acceleration_limit stands out" in apart.reason
+
+
+def weighed(monkeypatch, gains, class_of, wheels=True):
+    """The verdict in one round of three effects, by what each gains in blocks that were held back."""
     def candidate(effect, axes, gain):
         one = Hypothesis(effect, tuple(Axis(f"{effect}.{i}", 1.0) for i in range(axes)))
-        return Candidate(one, gain, 1e-4, 1.0, replace(base, cost=gain))
+        return Candidate(one, gain, 1e-4 if gain > 55 or wheels else 0.01, 1.0, replace(base, cost=gain))
 
     evidence = drives(np.zeros(4))
     linear = Linear(evidence)
@@ -183,10 +204,8 @@ def test_of_effects_that_predict_held_back_blocks_as_well_the_simplest_is_named(
     monkeypatch.setattr(alone, "EFFORT", Effort(rounds=1))
     monkeypatch.setattr(alone, "candidates_of", candidates_of)
     monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(told[fit.cost]))
-    monkeypatch.setattr(alone, "class_of", lambda asked, best, _: [best.hypothesis.effect])
-    found = search_alone(asked)
-    assert named(found) == ("named", [result])
-    assert ("acceleration_limit" in found.classes[0]) == (gains[0][1] > 0)
+    monkeypatch.setattr(alone, "class_of", class_of)
+    return search_alone(asked, wheels=wheels)
 
 
 def test_with_nothing_found_it_says_that_it_cannot_tell():
