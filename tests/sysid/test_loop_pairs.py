@@ -11,7 +11,7 @@ from sysid.follow_up.power import SEED, Days, false_alarms, power_curve
 from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit, moved_last
-from sysid.pages.loop_report import detectable
+from sysid.pages.loop_power import detectable
 from sysid.verdict.found import tail
 from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
 from sysid.verdict.posterior import Thresholds

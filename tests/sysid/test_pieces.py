@@ -13,7 +13,7 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 from sysid.errors import bin_objective
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
-from sysid.replay import pieces, rollout
+from sysid.replay import differences, pieces, rollout
 from sysid.replay.differences import CourseReplay, DifferenceReplay
 from sysid.search import least_squares
 from sysid.search.valleys import from_all
@@ -75,12 +75,12 @@ def test_some_drives_stay_whole(unicycle_log, why):
 def test_pieces_begin_at_the_speeds_that_were_measured(unicycle_log):
     trial = unicycle_log.training[0]
     times = np.array([-1.0, 1.5, 2.5])
-    speeds = pieces.speeds_at(trial, times)
+    speeds = differences.speeds_at(trial, times)
     assert not speeds[0].any()
     for time, found in zip(times[1:], speeds[1:], strict=True):
         near = np.abs(trial.odometry.t - time) < 0.15
         assert trial.odometry.v[near].min() <= found[0] <= trial.odometry.v[near].max()
-    unseen = pieces.speeds_at(dataclasses.replace(trial, odometry=None), times)
+    unseen = differences.speeds_at(dataclasses.replace(trial, odometry=None), times)
     held = np.searchsorted(trial.command.t, times[1:], side="right") - 1
     np.testing.assert_allclose(unseen[1:, 0], trial.command.v[held])
 
