@@ -462,7 +462,8 @@ def test_an_accelerator_replays_the_same_in_large_calls(sloping, monkeypatch):
     every = np.arange(len(made.trials))
     values = np.array([list(base_values(sloping.full).values())] * len(every))
     usual = sloping.prepared.paths(values, made.batch, every)
-    monkeypatch.setattr("sysid.replay.rollout.on_processor", lambda: False)
+    for module in ("rollout", "one_drive"):
+        monkeypatch.setattr(f"sysid.replay.{module}.on_processor", lambda: False)
     monkeypatch.setattr("sysid.replay.rollout.FETCHED", 2)
     large = copy.copy(sloping.prepared.paths)
     for large.rows in (len(every) - 2, len(every) + 5):  # the second one has rows to spare, of which one is fetched

@@ -135,7 +135,7 @@ def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, mo
     evidence = drives(np.zeros(4))
     scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
     days = simulated_days(evidence, wander, scan)
-    monkeypatch.setattr("sysid.pages.loop_report.base_values", lambda _: dict.fromkeys(
+    monkeypatch.setattr("sysid.pages.loop_power.base_values", lambda _: dict.fromkeys(
         (one.axes[0].parameter for one in EFFECTS), 0.0))
     result = SimpleNamespace(search=SimpleNamespace(scan=scan, findings=None), evidence=evidence, hypotheses=EFFECTS,
                              full=None, prepared=SimpleNamespace(wander=wander),
