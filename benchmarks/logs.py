@@ -76,7 +76,8 @@ def said_of_log(robot: Robot, drives: list[Drive]) -> tuple[str, ...]:
 
 def said_of_bag(sent: list[Drive], got: list[Drive]) -> tuple[str, ...]:
     """What `sysid.convert` says of recordings with the times `sent` in the headers, received at the times `got`."""
-    from sysid.logs.rosbag import Bag, BagStream, clock_notes, in_order, stream_times
+    from sysid.logs.bags.clocks import clock_notes, in_order, stream_times
+    from sysid.logs.bags.recording import Bag, BagStream
 
     said: list[str] = []
     for one, other in zip(sent, got, strict=True):

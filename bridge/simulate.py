@@ -63,7 +63,7 @@ class ChairSimulator:
         """
         import jax
 
-        from whill_mjx import env as environment
+        import whill_mjx.env as environment
         from whill_mjx.sensors.camera import Camera
         from whill_mjx.tasks.tasks import make_task
         from whill_mjx.vehicle.kinematics import reference_pose

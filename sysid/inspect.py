@@ -23,7 +23,8 @@ import numpy as np
 
 from sysid import command_line
 from sysid.logs.coverage import Blind
-from sysid.logs.inspection import inspect, load_whole, text
+from sysid.logs.inspection import inspect, text
+from sysid.logs.measured import load_whole
 from sysid.logs.next_drives import NextDrive, next_drives
 from sysid.logs.records import Log
 from whill_mjx.io.command_line import POSITIVE, Range

@@ -28,7 +28,7 @@ from sysid.logs.directions import (
     motion_of,
     pooled,
 )
-from sysid.logs.records import Trial, command_in_force
+from sysid.logs.records import Trial
 from sysid.logs.streams import SMOOTHING, speeds
 
 LITTLE = 0.75  # share of the motion that a direction must explain, below which something is wrong
@@ -112,8 +112,8 @@ def _is_mirrored(motions: Sequence[Motion], reach: float) -> bool:
 
 def _obeys(trials: Sequence[Trial]) -> bool:
     """Whether the odometry's yaw rate has the sign of the commanded one."""
-    found = [_likeness(one.odometry.omega, one.command.omega[np.maximum(
-        command_in_force(one.command, one.odometry.t - RESPONSE), 0)]) for one in trials if one.odometry is not None]
+    found = [_likeness(one.odometry.omega, one.command.at(one.odometry.t - RESPONSE)[1])
+             for one in trials if one.odometry is not None]
     return bool(np.median(found) > 0)
 
 
@@ -171,8 +171,7 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
     inside = (t > source.t[0] + half) & (t < source.t[-1] - half)
     x, y, yaw = ((np.interp(t + half, source.t, one) - np.interp(t - half, source.t, one)) / (2 * half) * inside
                  for one in (source.x, source.y, source.yaw))
-    held = command_in_force(trial.command, t - RESPONSE)
-    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
+    v, omega = trial.command.at(t - RESPONSE, (0.0, 0.0))
     commanded = beside or odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
     if odometry is not None and not commanded:
         v, omega = (np.interp(t, odometry.t, one, 0.0, 0.0) for one in (odometry.v, odometry.omega))
@@ -213,8 +212,7 @@ def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.n
 def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [s], speed and yaw rate that a vehicle has which follows its commands with a usual lag."""
     t = np.arange(trial.command.t[0], max(trial.duration, trial.command.t[-1]), LAG_DT / 2)
-    held = np.maximum(command_in_force(trial.command, t), 0)
-    v, omega = trial.command.v[held].copy(), trial.command.omega[held].copy()
+    v, omega = trial.command.at(t)
     share = 1 - np.exp(-LAG_DT / 2 / RESPONSE)
     for k in range(1, len(t)):
         v[k], omega[k] = v[k - 1] + share * (v[k] - v[k - 1]), omega[k - 1] + share * (omega[k] - omega[k - 1])

@@ -10,7 +10,7 @@ import numpy as np
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.directions import UNLIKE
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.records import CHECK, Command, Log, Trial, command_in_force
+from sysid.logs.records import CHECK, Command, Log, Trial
 from sysid.logs.stated_sizes import wrong_sizes
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import forward_jump, pauses, set_forward, time_faults, uncommanded
@@ -214,8 +214,8 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
     rates = speeds(trial, channel)
     if rates is None:
         return None
-    held = command_in_force(trial.command, rates[0] - 0.3)  # the response takes a while; only the rough size counts
-    commanded = np.where(held >= 0, (trial.command.v, trial.command.omega)[index - 1][np.maximum(held, 0)], 0.0)
+    # The response takes a while; only the rough size counts.
+    commanded = trial.command.at(rates[0] - 0.3, (0.0, 0.0))[index - 1]
     if commanded.std() < 0.05:
         return None
     centred = commanded - commanded.mean()
@@ -244,9 +244,7 @@ def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:
     for trial in trials:
         rates = speeds(trial, channel)
         if rates is not None:
-            command = (trial.command.v, trial.command.omega)[index - 1]
-            now, before = (command[np.maximum(command_in_force(trial.command, rates[0] - ago), 0)]
-                           for ago in (0.0, SETTLED))
+            now, before = (trial.command.at(rates[0] - ago)[index - 1] for ago in (0.0, SETTLED))
             rows.append(np.abs(np.column_stack([now, rates[index]])[now == before]))
     asked, seen = np.concatenate(rows).T if rows else np.zeros((2, 0))
     if len(asked) < FEW:

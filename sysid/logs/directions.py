@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.records import Trial, command_in_force
+from sysid.logs.records import Trial
 
 GRID_DT, SMOOTHING = 0.02, 0.2  # s between instants, and over which a pose is differenced
 RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
@@ -63,8 +63,7 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
 
     steps, turn = (np.stack([at(t + half, one) - at(t - half, one) for one in columns], axis=-1) / (2 * half)
                    for columns in ((source.x, source.y), (source.yaw,)))
-    held = command_in_force(trial.command, t - RESPONSE)
-    v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0) for one in (trial.command.v, trial.command.omega))
+    v, omega = trial.command.at(t - RESPONSE, (0.0, 0.0))
     if odometry is not None and odometry.v.std() > NONE:
         shifts = np.linspace(-half, half, 5)
         v, omega = (np.mean([np.interp(t + shift, odometry.t, one) for shift in shifts], axis=0)

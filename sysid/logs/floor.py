@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from sysid.logs.records import Command, Trial, command_in_force
+from sysid.logs.records import Command, Trial
 
 DT = 0.05  # s, grid of the sums
 SETTLED = 2.0  # s of constant commands after which speeds count as reached
@@ -74,9 +74,7 @@ def sums_of(trial: Trial) -> Sums | None:
     t = (edge[1:] + edge[:-1]) / 2
     turning = np.diff(np.interp(edge, trial.gyro.t, trial.gyro.turn)) / DT
     v, omega = (np.interp(t, trial.odometry.t, one) for one in (trial.odometry.v, trial.odometry.omega))
-    held = command_in_force(trial.command, t)
-    wanted = [np.where(held >= 0, one[np.maximum(held, 0)], start) for one, start in (
-        (trial.command.v, trial.start.v), (trial.command.omega, trial.start.omega))]
+    wanted = trial.commanded(t)
     reached = t - last_change(trial.command, t) >= SETTLED
     pairs = ((turning, omega), (omega, wanted[1]), (v, wanted[0]))
     ratios = np.array([[np.sum(one[reached] * other[reached]), np.sum(other[reached] ** 2)] for one, other in pairs])

@@ -4,46 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity
-from sysid.logs.log import load_log
-from sysid.logs.measured import detect_format, drive_spec, load_drive, load_mrclam, split
 from sysid.logs.records import Log
 from sysid.logs.streams import Shift, StreamQuality, clock_shift, pose_jitter, response_shift, trial_quality
 
 MAX_ROWS = 40  # trials listed one by one; more are summed up by group
 POSE_JITTER = 0.003  # s, more than rounding and noise of the speeds explain
-
-
-def load_whole(path: str | Path, select: tuple[str, ...] = (), form: str = "auto") -> Log:
-    """Any known log without a split into training and held-out trials where it declares none.
-
-    DRIVE windows are chained to steps of 6 s: two seconds are too short to compare clocks.
-    """
-    form = detect_format(path) if form == "auto" else form
-    keys = tuple(dict.fromkeys(one.partition(":")[0] for one in select))
-    if form == "dataset":
-        log: Log = load_log(path)
-    elif form == "drive_norlab":
-        log = load_drive(path, keys or drive_runs(path), chained=True)
-    else:
-        robots = tuple(int(key.removeprefix("robot")) for key in keys if key.removeprefix("robot").isdigit())
-        log = load_mrclam(path, robots or (1, 2, 3, 4, 5))
-    return split(log, select, ()) if select else log
-
-
-def drive_runs(folder: str | Path) -> tuple[str, ...]:
-    """The runs in a folder of DRIVE data of the robot that has most of them."""
-    runs = sorted(path.name.split(".")[0] for path in Path(folder).glob("*") if path.name.endswith((".npz", ".csv.gz")))
-    robots: dict[str, list[str]] = {}
-    for run in runs:
-        robots.setdefault(drive_spec(run).name, []).append(run)
-    most = max(robots, key=lambda robot: len(robots[robot]))
-    return tuple(robots[most])
 
 
 def inspect(log: Log) -> dict[str, Any]:

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.columns import Table
 from sysid.logs.log import read_fields, spec_from_fields
-from sysid.logs.records import Log, OdometryStream, PoseStream, Trial, command_in_force
+from sysid.logs.records import Log, OdometryStream, PoseStream, Trial
 from sysid.logs.sources import LEROBOT_INFO
+from sysid.logs.tables.columns import Table
 from whill_mjx.io.fields import shown
 from whill_mjx.io.reading import LONGEST_REASON, read_json
 from whill_mjx.logs.dataset import write_fields, write_json
@@ -244,8 +244,7 @@ def _frames(trial: Trial, fps: int, features: Mapping[str, Sequence[str]]) -> di
     for name in features:
         stream = getattr(trial, FEATURES[name][0])
         if name == "action":
-            held = command_in_force(stream, begin + t + 0.5 / fps)
-            values = np.where((held >= 0)[:, None], stream.table[np.maximum(held, 0), 1:], 0.0)
+            values = stream.at(begin + t + 0.5 / fps, (0.0, 0.0)).T
         else:
             values = np.column_stack([np.interp(begin + t, stream.t, column) for column in _columns(trial, stream)])
         found[name] = values.astype(np.float32)

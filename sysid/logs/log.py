@@ -6,7 +6,6 @@ reference point: the centre of the driven axle (the vehicle's centre for skid dr
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.gyro import with_sign
+from sysid.logs.hashes import hash_files
 from sysid.logs.records import (
     Command,
     GyroStream,
@@ -27,7 +27,6 @@ from sysid.logs.records import (
     with_timeout,
 )
 from whill_mjx.io import fields as tables
-from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.io.formats import upgraded
 from whill_mjx.io.reading import read_csv as read_table
 from whill_mjx.io.reading import read_toml
@@ -204,22 +203,6 @@ def check_same_vehicle(
         if mine != theirs:
             raise ValueError(f"{place}: {name} is {theirs}, but {mine} in {log.name!r}. {rule}; correct dataset.toml "
                              "or leave it out.")
-
-
-def hash_files(folder: Path) -> str:
-    """SHA-256 over names and contents of all data files of a dataset."""
-    digest = hashlib.sha256()
-    results = {path.parent for path in folder.rglob(RUN_FILE)}  # of commands that were given a place in here
-    for path in sorted(folder.rglob("*")):
-        unfinished = any(part.startswith(".") for part in path.relative_to(folder).parts)  # of a killed conversion
-        if unfinished or not results.isdisjoint(path.parents):
-            continue
-        if path.suffix in (".toml", ".csv", ".npz", ".gz") and path.is_file():
-            digest.update(str(path.relative_to(folder)).encode() + b"\0")
-            with path.open("rb") as file:
-                while part := file.read(1 << 20):
-                    digest.update(part)
-    return digest.hexdigest()
 
 
 def read_fields(path: Path) -> dict[str, Any]:

@@ -1,67 +1,20 @@
-"""Loaders of two published measured datasets, in their original form, into the same in-memory log.
-
-`drive_norlab`: commanded wheel speeds against lidar ICP motion of skid-steered robots (Baril et al., "DRIVE", ICRA
-2024, github.com/norlab-ulaval/DRIVE, BSD-3-Clause). `mrclam`: UTIAS Multi-Robot Cooperative Localization and Mapping
-(Leung et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam): five iRobot Create and motion capture.
-
-Each window restarts from the measured pose and wheel speeds. A pose is scored only where its value changed, because
-both systems repeat the last value between updates.
-
-Two faults of the DRIVE files are mended here. Their converter turned the positions of a window by the mean of its first
-five yaws but counted yaw from the first one; and an ICP update that fell between two windows is in neither.
-"""
+"""One loader of all logs that a fit can read: datasets, and two published measured sets in their original form."""
 
 from __future__ import annotations
 
-import io
-import warnings
-from array import array
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sysid.logs.command_timeout import with_own_timeout
-from sysid.logs.gyro import sign_shown, with_sign
-from sysid.logs.log import hash_files, load_log
-from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.log import load_log
+from sysid.logs.published.drive_norlab import load_drive, most_runs
+from sysid.logs.published.mrclam import ROBOTS, load_mrclam, mrclam_files, mrclam_robots
+from sysid.logs.records import Log, Trial
 from sysid.logs.sources import about
 from sysid.logs.streams import without_held
 from sysid.logs.unusable import without_lost, without_standing
 from sysid.logs.windows import in_windows
-from whill_mjx.io.fields import counted, shown
-from whill_mjx.io.reading import ARRAY_BYTES, LONGEST_REASON, csv_rows, read_arrays, read_gzip, read_text
-from whill_mjx.vehicle.specs import CREATE, HUSKY, WARTHOG, VehicleSpec
-
-DRIVE_DT = 0.05  # s, sampling of the DRIVE windows (20 Hz)
-DRIVE_ROWS = 40  # samples of one window (2 s)
-DRIVE_COLUMNS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")
-TERRAINS = ("asphalt", "grass", "gravel", "ice", "mud", "sand", "snow", "tile")
-MAX_NANOSECONDS = 86_400 * 10**9
-CONTINUOUS_COLUMNS = (
-    *(f"icp_quat_{axis}" for axis in "xyzw"), "icp_pos_x", "icp_pos_y", "meas_left_vel", "meas_right_vel", "cmd_vel_x",
-    "cmd_vel_omega")
-YAW_RATE = "imu_z"  # of a continuous log
-LARGEST = 1e6  # m, rad or rad/s that a measured value stays below
-DRIVE_ENDS = (".npz", ".csv", ".csv.gz")
-CONVERT = "Convert the original again"
-ORIGINAL = "Use the original file."
-DRIVE_STEP_ROWS = 3  # windows of one step of constant command (6 s)
-MOVING = 0.05  # m of track or wheel travel below which a window shows nothing
-FRAME_SAMPLES = 5  # samples whose mean yaw the converter of the DRIVE windows took for the frame of their positions
-RARE = 0.5  # of an update, by which intervals that a run does not show are counted
-BREAK = 0.5  # probability of a lost update from which the motion over a joint is not compared bin by bin
-HELD = 1e-9  # difference [m, rad] below which two poses are one that was held: rounding differs from sample to sample
-ROBOTS = ("robot1", "robot2", "robot3", "robot4", "robot5")
-MRCLAM_WINDOW = 15.0  # s
-MRCLAM_SPACING = 0.1  # s between scored poses; the motion capture runs at 65 Hz, its errors are correlated
-START_SPAN = 0.15
-"""Time before and after the start of an MRCLAM window [s] over which the speeds there are measured: its robots follow
-their commands later than that."""
-MAX_GAP = 0.5  # s without a measurement; windows with a longer gap are left out
 
 
 def detect_format(path: str | Path) -> str:
@@ -78,427 +31,12 @@ def detect_format(path: str | Path) -> str:
     raise ValueError(f"{path}: {about(path)}")
 
 
-def mrclam_files(folder: Path, robot: str, kind: str) -> list[Path]:
-    """Files of MRCLAM robots in a folder: as in its archives, or with the data set in front, packed or not."""
-    return sorted(path for end in ("", ".gz") for path in folder.glob(f"*Robot{robot}_{kind}.dat{end}"))
-
-
-def mrclam_robots(keys: Sequence[str]) -> tuple[int, ...]:
-    """Numbers of the robots that selections name: robot1 or one of its trials; ValueError where one names none."""
-    robots = [key.split("/")[0] for key in keys]
-    for key, robot in zip(keys, robots, strict=True):
-        if robot not in ROBOTS:
-            raise ValueError(f"selection {key!r}: MRCLAM has robot1 to robot5. Give one of them.")
-    return tuple(dict.fromkeys(ROBOTS.index(robot) + 1 for robot in robots))
-
-
 def is_known(path: Path) -> bool:
     """Whether a folder is a dataset or a measured set."""
     try:
         return bool(detect_format(path))
     except (ValueError, FileNotFoundError):
         return False
-
-
-def drive_spec(run: str) -> VehicleSpec:
-    """Nominal geometry of the robot that drove `run`, a Warthog unless its name says otherwise (the constants and their
-    sources are in whill_mjx.vehicle.specs)."""
-    return HUSKY if HUSKY.name in run else WARTHOG
-
-
-def drive_files(folder: Path) -> dict[str, Path]:
-    """Run -> file of the DRIVE runs in a folder."""
-    return {path.name.split(".")[0]: path for path in sorted(folder.glob("*")) if path.name.endswith(DRIVE_ENDS)}
-
-
-def drive_selection(folder: Path, keys: Sequence[str]) -> tuple[str, ...]:
-    """Runs that selections name: RUN, one of its trials, or GROUP; FileNotFoundError where one names none."""
-    runs = drive_files(folder)
-    chosen: list[str] = []
-    for key in keys:
-        found = [run for run in runs if key.split("/")[0] == run or key == drive_group(run)]
-        if not found:
-            known = sorted({*runs, *map(drive_group, runs)})
-            raise FileNotFoundError(f"{folder}: no run {key!r} (known: {', '.join(known)}).")
-        chosen += found
-    return tuple(dict.fromkeys(chosen))
-
-
-def drive_group(run: str) -> str:
-    """Terrain of a run: warthog_sand_1 -> sand; the run's own name where the terrain is not stated."""
-    return next((word for word in run.split("_") if word in TERRAINS), run)
-
-
-def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
-    """Load DRIVE runs of one robot from a folder of .npz and .csv.gz files: a trial per window, named
-    RUN/STEP.WINDOW.
-
-    Args:
-        runs: file stems, or groups of them, e.g. ("warthog_sand_1",).
-        chained: join the three 2 s windows of a step into one of 6 s. The joints can miss an ICP update; the motion
-            is then that of wheels and gyro, by its probability, and the note on the log states how often and how much.
-
-    `fields`: "gyro" has the mean gyro yaw rate of each window, "yaw_rate" all of it (times [s], rates [rad/s]), and
-    "pose_stamps" is "receipt": how old a pose is at its stamp is not known.
-    """
-    folder = Path(folder)
-    runs, files = drive_selection(folder, runs), drive_files(folder)
-    specs = {drive_spec(run) for run in runs}
-    if len(specs) != 1:
-        raise ValueError(f"{folder}: runs {runs} are of {len(specs)} different robots; fit one robot at a time.")
-    trials: list[Trial] = []
-    notes = []
-    gyro: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for run in runs:
-        if files[run].suffix == ".npz":
-            run_trials, note, run_gyro = _drive_windows(files[run], run, chained)
-            gyro.update(run_gyro)
-        else:
-            run_trials, note = _drive_continuous(files[run], run, 6.0 if chained else 2.0)
-            gyro.update({one.name: (one.gyro.t, np.gradient(one.gyro.turn, one.gyro.t)) for one in run_trials
-                         if one.gyro is not None})
-        if not any(spec.name in run for spec in (HUSKY, WARTHOG)):
-            note += "; its name has no robot: it is taken for a Warthog"
-        trials += run_trials
-        notes.append(note)
-    return Log("drive_norlab", specs.pop(), tuple(trials), hash_files(folder), tuple(notes),
-               {"gyro": {name: float(rate.mean()) for name, (_, rate) in gyro.items()}, "yaw_rate": gyro,
-                "pose_stamps": "receipt"})
-
-
-def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5)) -> Log:
-    """Load MRCLAM robots as consecutive windows in which the robot was commanded to move."""
-    folder = Path(folder)
-    trials: list[Trial] = []
-    notes = []
-    for robot in robots:
-        robot_trials, note = _mrclam_robot(folder, robot, MRCLAM_WINDOW)
-        trials += robot_trials
-        notes.append(note)
-    return Log("mrclam", CREATE, tuple(trials), hash_files(folder), tuple(notes))
-
-
-def only_changes(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> PoseStream:
-    """The samples at which the pose differs from the one before (yaw unwrapped); the first sample is the start."""
-    yaw = np.unwrap(yaw)
-    moved = np.abs([np.diff(x), np.diff(y), np.diff(yaw)]).max(axis=0)
-    changed = np.flatnonzero(moved > HELD) + 1
-    return PoseStream(t[changed], x[changed], y[changed], yaw[changed])
-
-
-def twist_from_wheels(spec: VehicleSpec, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(v [m/s], omega [rad/s]) of an ideal differential drive from wheel speeds [rad/s]."""
-    return spec.wheel_radius * (left + right) / 2, spec.wheel_radius * (right - left) / spec.track
-
-
-def _drive_windows(path: Path, run: str, chained: bool
-                   ) -> tuple[list[Trial], str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    blocks = _drive_blocks(path)
-    spec = drive_spec(run)
-    command_v, command_omega = twist_from_wheels(spec, blocks["cmd_left"], blocks["cmd_right"])
-    wheel_v, wheel_omega = twist_from_wheels(spec, blocks["left_wheel_vel"], blocks["right_wheel_vel"])
-    x, y, yaw = in_first_frame(blocks["icp_x"], blocks["icp_y"], blocks["icp_yaw"])
-    gyro, count = blocks["imu_yaw"], len(x)
-    sign = sign_shown([(DRIVE_DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
-    gyro *= sign or 1.0
-    joints = _joints(x, y, yaw, wheel_v, gyro) if chained else None
-    length = DRIVE_STEP_ROWS if chained else 1
-    t = np.arange(DRIVE_ROWS * length) * DRIVE_DT
-    trials: list[Trial] = []
-    missed: list[tuple[float, float]] = []
-    rates = {}
-    for row in range(0, count - length + 1, length):
-        rows = slice(row, row + length)
-        step, window = divmod(row, DRIVE_STEP_ROWS)
-        name = f"{run}/{step:03d}.{window}"
-        pose: tuple[np.ndarray, ...] = (x[row], y[row], yaw[row])
-        breaks: list[tuple[float, float]] = []
-        for k in range(row, row + length - 1):
-            assert joints is not None
-            likely = float(joints.probability[k])
-            pose = _chain(pose, (x[k + 1], y[k + 1], yaw[k + 1]), likely * joints.way[k], likely * joints.turn[k])
-            missed.append((likely, float(abs(joints.way[k]))))
-            if likely > BREAK:
-                before, after = (DRIVE_ROWS * (k - row) + joints.between[k]) * DRIVE_DT
-                breaks.append((float(before), float(after)))
-        command = Command(t, command_v[rows].ravel(), command_omega[rows].ravel())
-        odometry = OdometryStream(t, None, None, None, wheel_v[rows].ravel(), wheel_omega[rows].ravel())
-        start = Start(v=float(wheel_v[row, 0]), omega=float(wheel_omega[row, 0]), measured=True)
-        truth = only_changes(t, *pose)
-        if len(truth.t) == 0 or DRIVE_DT * np.abs(wheel_v[rows]).sum() + spec.track / 2 * DRIVE_DT * np.abs(
-                wheel_omega[rows]).sum() < MOVING:
-            continue
-        trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run),
-                            breaks=tuple(breaks), gyro=GyroStream.of_rates(t, gyro[rows].ravel())))
-        rates[name] = t, gyro[rows].ravel()
-    note = f"{run}: {len(trials)} windows of {DRIVE_DT * DRIVE_ROWS * length:g} s"
-    if sign != 1.0:
-        note += (", whose gyro turns against the outside yaw: its sign is changed" if sign else
-                 ", in which nothing turns enough to show the gyro's sign: it is taken as logged")
-    return trials, note + (_said_missed(missed) if chained else ""), rates
-
-
-def _drive_blocks(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a DRIVE file that are used, each (N, 40) of N windows, checked."""
-    arrays = read_arrays(path, "missing. Give the file of a run.", CONVERT)
-    missing = {"data", "columns"} - set(arrays)
-    if missing:
-        raise ValueError(f"{path}: no array {sorted(missing)[0]!r}. It needs `data` and `columns`; see its README.")
-    data, columns = arrays["data"], [str(name) for name in arrays["columns"].ravel()]
-    if data.dtype.kind not in "iuf" or data.ndim != 2 or data.shape[1] != len(columns):
-        raise ValueError(f"{path}: data is {data.dtype} of shape {data.shape}; it must be numbers, one column for each "
-                         f"of the {len(columns)} names in `columns`. {CONVERT}")
-    index = {name: i for i, name in enumerate(columns)}
-    blocks = {}
-    for name in DRIVE_COLUMNS:
-        try:
-            blocks[name] = data[:, [index[f"{name}_{i}"] for i in range(DRIVE_ROWS)]]
-        except KeyError as error:
-            raise ValueError(f"{path}: no column {error}. It needs {name}_0 to {name}_{DRIVE_ROWS - 1}.") from None
-        if not (np.abs(blocks[name]) < LARGEST).all():
-            raise ValueError(f"{path}: {name} is not finite, or {LARGEST:g} or more. {CONVERT} and leave out "
-                             "incomplete windows.")
-    return blocks
-
-
-def _said_missed(missed: list[tuple[float, float]]) -> str:
-    """How often a joint lost an update of the pose, and how much: of each joint its probability and the way [m]."""
-    likely, way = np.array(missed or [(0.0, 0.0)]).T
-    late = way[likely > BREAK] if (likely > BREAK).any() else np.zeros(1)
-    return (f", chained by the last pose of each 2 s window: {likely.mean():.0%} of the joints seem to miss an ICP "
-            f"update, whose motion is taken from wheels and gyro: {np.median(late):.2f} m (median), {late.max():.2f} m "
-            "at most")
-
-
-def in_first_frame(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Windows (N, 40) in the frame of their first sample, yaw unwrapped.
-
-    The publishers' converter (dataset_parser.py, build_torch_ready_dataset) turned the positions by the mean of the
-    first five yaws, which it did not unwrap: where yaw passes +-pi within them the mean is far off.
-    """
-    turned = yaw[:, :FRAME_SAMPLES].mean(axis=1, keepdims=True)
-    cos, sin = np.cos(turned), np.sin(turned)
-    return cos * x - sin * y, sin * x + cos * y, np.unwrap(yaw, axis=1)
-
-
-@dataclass(frozen=True)
-class _Joints:
-    """What is lost between each window of N and the next one: an ICP update may be in neither."""
-
-    probability: np.ndarray  # (N - 1,) that one is lost
-    way: np.ndarray  # (N - 1,) m, that the wheels went between the last update of a window and its end
-    turn: np.ndarray  # (N - 1,) rad, that the gyro turned meanwhile
-    between: np.ndarray  # (N - 1, 2) int, samples of the update before and of the one after, from the window's start
-
-
-def _joints(x: np.ndarray, y: np.ndarray, yaw: np.ndarray, v: np.ndarray, omega: np.ndarray) -> _Joints:
-    """Joints of windows (N, 40) in the frame of their first sample.
-
-    An update at a window's first sample shows in none. Whether there was one follows from two things. Updates come at
-    the run's usual intervals: either one lasts over the joint, or two meet there. And the first update of a window is
-    as far from the one before as wheels and gyro moved meanwhile: since the last update of the window before, or since
-    the window's start alone. Within windows both are apart by so much (Laplace, which bears jumps).
-    """
-    count = len(x)
-    changes: list[list[int]] = [
-        (np.flatnonzero(np.abs(np.diff([x[k], y[k], yaw[k]], axis=1)).max(axis=0) > HELD) + 1).tolist()
-        for k in range(count)]
-    way, turn = (DRIVE_DT * np.cumsum(np.pad(rate, ((0, 0), (1, 0))), axis=1) for rate in (v, omega))  # before a sample
-
-    def apart(k: int, begin: int, end: int, gone: float, turned: float) -> np.ndarray:
-        """(2,) motion of the ICP between two samples of a window, less a way and a turn."""
-        middle = (yaw[k, begin] + yaw[k, end]) / 2
-        ahead = np.cos(middle) * (x[k, end] - x[k, begin]) + np.sin(middle) * (y[k, end] - y[k, begin])
-        return np.array([ahead - gone, yaw[k, end] - yaw[k, begin] - turned])
-
-    inside = [apart(k, a, b, way[k, b] - way[k, a], turn[k, b] - turn[k, a])
-              for k in range(count) for a, b in pairwise(changes[k])]
-    usual = np.abs(inside).mean(axis=0) if inside else np.ones(2)
-    found = _Joints(np.zeros(count - 1), np.zeros(count - 1), np.zeros(count - 1),
-                    np.full((count - 1, 2), DRIVE_ROWS))
-    ratio = np.full(count - 1, np.nan)
-    for k in range(count - 1):
-        if len(changes[k]) and len(changes[k + 1]):
-            last, first = changes[k][-1], changes[k + 1][0]
-            found.between[k] = last, DRIVE_ROWS + first
-            found.way[k], found.turn[k] = way[k, -1] - way[k, last], turn[k, -1] - turn[k, last]
-            lost = apart(k + 1, 0, first, way[k + 1, first], turn[k + 1, first])
-            whole = lost - [found.way[k], found.turn[k]]
-            ratio[k] = ((np.abs(whole) - np.abs(lost)) / np.maximum(usual, HELD)).sum()
-    known = np.isfinite(ratio)
-    intervals = np.bincount([b - a for one in changes for a, b in pairwise(one)], minlength=2 * DRIVE_ROWS) + RARE
-    rate = np.log(intervals / intervals.sum())
-    last, first = found.between[known, 0], found.between[known, 1]
-    ratio[known] += rate[DRIVE_ROWS - last] + rate[first - DRIVE_ROWS] - rate[first - last]
-    found.probability[known] = 1 / (1 + np.exp(-np.clip(ratio[known], -50, 50)))
-    return found
-
-
-def _chain(
-    first: tuple[np.ndarray, ...], second: tuple[np.ndarray, ...], way: float, turn: float
-) -> tuple[np.ndarray, ...]:
-    """Both windows in the frame of the first, the second of which starts that far on [m, rad]."""
-    x0, y0, yaw0 = (float(values[-1]) for values in first)
-    x0, y0, yaw0 = x0 + way * np.cos(yaw0 + turn / 2), y0 + way * np.sin(yaw0 + turn / 2), yaw0 + turn
-    cos, sin = np.cos(yaw0), np.sin(yaw0)
-    x, y, yaw = second
-    return (np.concatenate([first[0], x0 + cos * x - sin * y]), np.concatenate([first[1], y0 + sin * x + cos * y]),
-            np.concatenate([first[2], yaw0 + yaw]))
-
-
-def _drive_continuous(path: Path, run: str, window: float) -> tuple[list[Trial], str]:
-    """Windows of the continuous log during its calibration phases (elsewhere a joystick drove and was not logged)."""
-    columns, times, states = _read_rows(path)
-
-    def column(name: str) -> np.ndarray:
-        values = np.array(columns[name])
-        if (np.abs(values) >= LARGEST).any():
-            raise ValueError(f"{path}: {name} is {LARGEST:g} or more. {CONVERT}.")
-        return values
-
-    spec = drive_spec(run)
-    t = _nanoseconds(path, times)
-    calibrating = np.array(states)
-    qx, qy, qz, qw = (column(f"icp_quat_{axis}") for axis in "xyzw")
-    yaw = np.unwrap(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
-    x, y = column("icp_pos_x"), column("icp_pos_y")
-    wheel_v, wheel_omega = twist_from_wheels(spec, column("meas_left_vel"), column("meas_right_vel"))
-    command_v, command_omega = column("cmd_vel_x"), column("cmd_vel_omega")
-    turning = column(YAW_RATE) if YAW_RATE in columns else np.full(len(t), np.nan)
-    finite = np.isfinite([x, y, yaw, wheel_v, wheel_omega, command_v, command_omega]).all(axis=0)
-    trials = []
-    for number, begin in enumerate(np.arange(0.0, t[-1] - window, window)):
-        inside = np.flatnonzero((t >= begin) & (t < begin + window))
-        if len(inside) < 10 or not (calibrating & finite)[inside].all() or np.diff(t[inside]).max() > MAX_GAP:
-            continue
-        first = inside[0]
-        now = t[inside] - t[first]
-        cos, sin = np.cos(yaw[first]), np.sin(yaw[first])
-        dx, dy = x[inside] - x[first], y[inside] - y[first]
-        truth = only_changes(now, cos * dx + sin * dy, -sin * dx + cos * dy, yaw[inside] - yaw[first])
-        if len(truth.t) == 0 or np.abs(wheel_v[inside]).max() + np.abs(wheel_omega[inside]).max() < MOVING:
-            continue
-        command = Command(now, command_v[inside], command_omega[inside])
-        odometry = OdometryStream(now, None, None, None, wheel_v[inside], wheel_omega[inside])
-        start = Start(v=float(wheel_v[first]), omega=float(wheel_omega[first]), measured=True)
-        gyro = GyroStream.of_rates(now, turning[inside]) if np.isfinite(turning[inside]).all() else None
-        trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run),
-                            gyro=gyro))
-    signed, said = with_sign(trials)
-    note = "; ".join([f"{run}: {len(trials)} windows of {window:g} s during calibration phases", *said])
-    return list(signed), note
-
-
-def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
-    """Numbers by column (nan where none), times and whether calibrating, of a continuous log; its first row is filler.
-    """
-    rows = csv_rows(path, read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}."))
-    header = next(rows, (0, []))[1]
-    for name in (*CONTINUOUS_COLUMNS, "ros_time", "calib_state"):
-        if name not in header:
-            raise ValueError(f"{path}: no column {name!r} (found {shown(sorted(header))}). {CONVERT}.")
-    index = {name: header.index(name) for name in header}
-    columns: dict[str, array] = {name: array("d") for name in (*CONTINUOUS_COLUMNS, YAW_RATE) if name in index}
-    times, states = [], []
-    for number, (line, row) in enumerate(rows):
-        if len(row) != len(header):
-            raise ValueError(f"{path}, line {line}: has {len(row)} cells, the header {len(header)}. {CONVERT}.")
-        if number == 0:
-            continue
-        for name, values in columns.items():
-            try:
-                values.append(float(row[index[name]] or "nan"))
-            except ValueError:
-                raise ValueError(f"{path}, line {line}: {name} is {shown(row[index[name]])}; it must be a number. "
-                                 f"{CONVERT}.") from None
-        times.append(row[index["ros_time"]])
-        states.append(row[index["calib_state"]] == "calib")
-    if len(times) < 2:
-        raise ValueError(f"{path}: {counted(len(times), 'row')} of data; at least 2 are needed. {CONVERT}.")
-    return columns, times, states
-
-
-def _nanoseconds(path: Path, texts: list[str]) -> np.ndarray:
-    """Seconds (T,) from the first of the clock's times in nanoseconds, which do not run back."""
-    try:
-        time = [int(float(text)) if "e" in text else int(text.split(".")[0]) for text in texts]
-    except (ValueError, OverflowError):
-        raise ValueError(f"{path}: ros_time is not a number of nanoseconds in every row. {CONVERT}.") from None
-    if max(time) - min(time) > MAX_NANOSECONDS:
-        raise ValueError(f"{path}: ros_time spans more than a day. {CONVERT}.")
-    t = np.array([one - time[0] for one in time], float) * 1e-9
-    if (np.diff(t) < 0).any():
-        raise ValueError(f"{path}: ros_time runs backwards. {CONVERT}.")
-    return t
-
-
-def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial], str]:
-    command = _read_table(folder, robot, "Odometry", 3)
-    truth = _read_table(folder, robot, "Groundtruth", 4)
-    path = np.column_stack([truth[:, :3], np.unwrap(truth[:, 3])])
-    begin, end = max(command[0, 0], truth[0, 0]), min(command[-1, 0], truth[-1, 0])
-    trials = []
-    for number, start_time in enumerate(np.arange(begin, end - window, window)):
-        inside = np.flatnonzero((truth[:, 0] >= start_time) & (truth[:, 0] < start_time + window))
-        if len(inside) < 10 or np.diff(truth[inside, 0]).max() > MAX_GAP:
-            continue
-        first = inside[0]
-        t0 = truth[first, 0]
-        held = max(int(np.searchsorted(command[:, 0], t0, side="right")) - 1, 0)
-        last = int(np.searchsorted(command[:, 0], truth[inside[-1], 0], side="right"))
-        t = np.maximum(command[held:last, 0] - t0, 0.0)
-        v, omega = command[held:last, 1], command[held:last, 2]
-        keep = np.append(np.diff(t) > 0, True)
-        if not (np.abs(v) > 0.005).any() and not (np.abs(omega) > 0.02).any():
-            continue
-        pose = only_changes(path[inside, 0] - t0, *path[inside, 1:].T)
-        start = replace(_speeds(path, t0), x=float(path[first, 1]), y=float(path[first, 2]), yaw=float(path[first, 3]))
-        trials.append(Trial(f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
-                            thin(pose, MRCLAM_SPACING), start, group=f"robot{robot}"))
-    return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are those of the outside pose"
-
-
-def _speeds(path: np.ndarray, at: float) -> Start:
-    """A start with the speeds that a path (T, 4) of time, x, y and yaw shows around a time: its slopes."""
-    near = path[np.abs(path[:, 0] - at) <= START_SPAN]
-    t = near[:, 0] - near[:, 0].mean()
-    vx, vy, omega = t @ near[:, 1:] / max(float(t @ t), HELD)
-    yaw = near[:, 3].mean()
-    return Start(v=float(vx * np.cos(yaw) + vy * np.sin(yaw)), omega=float(omega), measured=True)
-
-
-def thin(pose: PoseStream, spacing: float) -> PoseStream:
-    """The stream with samples at least `spacing` seconds apart."""
-    keep, last = [], -np.inf
-    for i, t in enumerate(pose.t):
-        if t - last >= spacing:
-            keep.append(i)
-            last = t
-    return PoseStream(pose.t[keep], pose.x[keep], pose.y[keep], pose.yaw[keep])
-
-
-def _read_table(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:
-    """The table (T, columns) of a robot as published, packed or not, whatever the number of the data set."""
-    found = mrclam_files(folder, str(robot), kind)
-    path = found[0] if found else folder / f"Robot{robot}_{kind}.dat"
-    if len(found) > 1:
-        raise ValueError(f"{path}: there is another one, {found[1].name}. Give a folder with one data set.")
-    missing = "missing. Robots are 1 to 5; get the files from asrl.utias.utoronto.ca/datasets/mrclam."
-    packed = path.suffix == ".gz"
-    text = read_gzip(path, missing, ORIGINAL) if packed else read_text(path, ARRAY_BYTES, missing)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an empty file, which is refused below
-            table = np.loadtxt(io.StringIO(text), ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{path}: {str(error)[:LONGEST_REASON]}. {ORIGINAL}") from None
-    if table.shape[1] != columns or not len(table):
-        raise ValueError(f"{path}: {table.shape} values; {columns} columns are needed. {ORIGINAL}")
-    if not np.isfinite(table).all() or (np.abs(table[:, 1:]) >= LARGEST).any() or np.ptp(table[:, 0]) > LARGEST:
-        raise ValueError(f"{path}: values must be finite and below {LARGEST:g}. {ORIGINAL}")
-    if (np.diff(table[:, 0]) < 0).any():
-        raise ValueError(f"{path}: time runs backwards. {ORIGINAL}")
-    return table
 
 
 def split(log: Log, train: tuple[str, ...], held_out: tuple[str, ...]) -> Log:
@@ -578,3 +116,20 @@ def _without_held(log: Log) -> Log:
     return replace(log, trials=trials, notes=(*log.notes,
         f"{before - after} of {before} rows of odometry and outside pose repeat the row before while the vehicle "
         "moves: they were held between updates and are not scored again"))
+
+
+def load_whole(path: str | Path, select: tuple[str, ...] = (), form: str = "auto") -> Log:
+    """Any known log without a split into training and held-out trials where it declares none.
+
+    DRIVE windows are chained to steps of 6 s: two seconds are too short to compare clocks. Of a DRIVE folder, the runs
+    of the robot that has most of them.
+    """
+    form = detect_format(path) if form == "auto" else form
+    keys = tuple(dict.fromkeys(one.partition(":")[0] for one in select))
+    if form == "dataset":
+        log: Log = load_log(path)
+    elif form == "drive_norlab":
+        log = load_drive(path, keys or most_runs(Path(path)), chained=True)
+    else:
+        log = load_mrclam(path, mrclam_robots(keys or ROBOTS))
+    return split(log, select, ()) if select else log

@@ -18,7 +18,6 @@ from sysid.logs.records import (
     Prediction,
     Start,
     Trial,
-    command_in_force,
     manoeuvre_of,
 )
 from sysid.logs.replicates import same_course, shifts
@@ -80,10 +79,7 @@ def ideal_replay(trial: Trial) -> Prediction:
     if trial.odometry is not None:
         t = trial.odometry.t
         x, y, yaw = integrate(trial.command, Start(), t)
-        held = command_in_force(trial.command, t)
-        moving = held >= 0
-        odometry = OdometryStream(t, x, y, yaw, np.where(moving, trial.command.v[held], trial.start.v),
-                                  np.where(moving, trial.command.omega[held], trial.start.omega))
+        odometry = OdometryStream(t, x, y, yaw, *trial.commanded(t))
     return Prediction(truth, odometry)
 
 

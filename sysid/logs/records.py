@@ -30,6 +30,12 @@ class Command:
         """(T, 3) of t [s], v [m/s] and omega [rad/s]."""
         return np.column_stack([self.t, self.v, self.omega])
 
+    def at(self, t: np.ndarray, before: tuple[float, float] | None = None) -> np.ndarray:
+        """(2, T) v [m/s] and omega [rad/s] in force at times t (T,) [s]; `before` the first, by default the first's."""
+        held = command_in_force(self, t)
+        found = np.stack([self.v, self.omega])[:, np.maximum(held, 0)]
+        return found if before is None else np.where(held >= 0, found, np.array(before)[:, None])
+
 
 @dataclass(frozen=True)
 class OdometryStream:
@@ -141,6 +147,10 @@ class Trial:
     def duration(self) -> float:
         """Time of the last measurement [s]; the trial starts at 0."""
         return max(float(s.t[-1]) for s in (self.odometry, self.ground_truth) if s is not None)
+
+    def commanded(self, t: np.ndarray) -> np.ndarray:
+        """(2, T) v [m/s] and omega [rad/s] in force at times t (T,) [s]; before the first command the start's."""
+        return self.command.at(t, (self.start.v, self.start.omega))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.records import Command, Trial, command_in_force
+from sysid.logs.records import Command, Trial
 
 EXACT = 1e-6  # s, m/s, rad/s that equal tables may differ by
 NONE = 1e-3  # m/s or rad/s of a command below which nothing moves
@@ -47,9 +47,7 @@ class Course:
     def at(self, t: np.ndarray) -> np.ndarray:
         """(T, 2) commands in force at times t (T,) since the first motion, 0 before and after the motion."""
         when = self.begin + t
-        held = command_in_force(self.command, when)
-        inside = ((held >= 0) & (when < self.end))[:, None]
-        return np.where(inside, self.command.table[np.maximum(held, 0), 1:], 0.0)
+        return np.where((when < self.end)[:, None], self.command.at(when, (0.0, 0.0)).T, 0.0)
 
 
 def course_of(trial: Trial) -> Course:

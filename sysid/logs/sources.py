@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sysid.logs.rosbag import SUFFIXES, find_bags, is_bag
+from sysid.logs.bags.recording import SUFFIXES, find_bags, is_bag
 from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 LEROBOT_INFO = "meta/info.json"

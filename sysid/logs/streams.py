@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.records import Command, OdometryStream, PoseStream, Trial, command_in_force
+from sysid.logs.records import Command, OdometryStream, PoseStream, Trial
 
 GRID_DT = 0.02  # s, of the signals that are compared
 SMOOTHING = 0.2  # s, over which positions are differenced
@@ -109,8 +109,7 @@ def _new_rows(stream: Any, moving: np.ndarray) -> Any:
 
 def _commanded(trial: Trial, t: np.ndarray) -> np.ndarray:
     """(T,) whether the command at times (T,) is to move."""
-    held = np.maximum(command_in_force(trial.command, t), 0)
-    return _moving(trial.command.v[held], trial.command.omega[held])
+    return _moving(*trial.command.at(t))
 
 
 def _moving(v: np.ndarray, omega: np.ndarray) -> np.ndarray:
@@ -167,10 +166,8 @@ def response_shift(trial: Trial, stream: str) -> dict[str, Shift]:
         return {}
     pose = trial.ground_truth if stream == "ground_truth" else None
     when = rates[0] if pose is None else np.arange(pose.t[0], pose.t[-1] + GRID_DT, GRID_DT)
-    held = command_in_force(trial.command, when)
     found = {}
-    for name, command, measured in (("v", trial.command.v, rates[1]), ("omega", trial.command.omega, rates[2])):
-        commanded = np.where(held >= 0, command[np.maximum(held, 0)], 0.0)
+    for name, commanded, measured in zip(("v", "omega"), trial.command.at(when, (0.0, 0.0)), rates[1:], strict=True):
         if pose is not None:
             commanded = _as_seen(when, commanded, pose, rates[0])
         if commanded.std() > MIN_SIGNAL[name] and (shift := find_shift(commanded, measured, lags=LAGS)) is not None:

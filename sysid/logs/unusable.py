@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.logs.records import Log, Trial, command_in_force
+from sysid.logs.records import Log, Trial
 from sysid.logs.streams import added_up, speeds
 
 LOST = 0.5  # yaw [rad] by which the outside pose may part from the rate: at 3 m/s it is off by 1.5 m a second later
@@ -98,9 +98,7 @@ def sizes_of(trial: Trial, reach: float) -> tuple[np.ndarray, np.ndarray]:
     for channel in ("odometry", "ground_truth"):
         rates = speeds(trial, channel)
         if rates is not None:
-            held = command_in_force(trial.command, rates[0] - RESPONSE)
-            v, omega = (np.where(held >= 0, one[np.maximum(held, 0)], 0.0)
-                        for one in (trial.command.v, trial.command.omega))
+            v, omega = trial.command.at(rates[0] - RESPONSE, (0.0, 0.0))
             found.append((np.hypot(v, reach * omega), np.hypot(rates[1], reach * rates[2])))
     return max(found, key=lambda one: _size(one[1]), default=(np.zeros(0), np.zeros(0)))
 

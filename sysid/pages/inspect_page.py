@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.records import Log, command_in_force
+from sysid.logs.records import Log
 from sysid.logs.streams import speeds
 from whill_mjx.io.folders import whole_file, write_whole
 from whill_mjx.io.html import Cell, Section, bullets, html_page, paragraph, png, table
@@ -186,9 +186,7 @@ def _liveliest(axis: Any, log: Log) -> None:
         if rates is not None:
             axis.plot(rates[0], rates[column], color=COLOURS[channel], label=LABELS[channel], linewidth=1.2)
     t = np.arange(0.0, trial.duration, 0.01)
-    held = np.maximum(command_in_force(trial.command, t), 0)
-    axis.plot(t, (trial.command.omega if turning else trial.command.v)[held], color="black", linewidth=1.0,
-              label="command")
+    axis.plot(t, trial.command.at(t)[int(turning)], color="black", linewidth=1.0, label="command")
     _label(axis, f"Command and motion: {trial.name}", "t [s]", label)
 
 

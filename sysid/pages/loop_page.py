@@ -20,7 +20,7 @@ from sysid.pages.loop_words import (
     spoken,
     title,
     vehicles,
-)
+)  # fmt: skip
 from sysid.pages.verdict_picture import draw
 from whill_mjx.io.html import Section, bullets, charts, heading, html_page, links, paragraph, table
 from whill_mjx.io.svg import PALETTE, Axes, Line, bar_chart, line_chart

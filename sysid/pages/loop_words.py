@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -227,3 +228,42 @@ def _differs(one: Mapping[str, Any]) -> bool:
 def _digits(low: float, high: float) -> int:
     width = abs(high - low)
     return min(max(1 - math.floor(math.log10(width)), 0), 6) if width > 0 else 3
+
+
+def shifts(rows: list[dict[str, Any]], least: float = FAR) -> list[str]:
+    """Base parameters that the last refit moved by more than so many day-to-day spreads, in words, furthest first."""
+    far = sorted((row for row in rows if abs(row["away"]) > least), key=lambda row: -abs(row["away"]))
+    return [f"{row['name']} {row['reference']:.4g} -> {row['after']:.4g} {row['unit']} ({row['away']:+.1f} spreads)"
+            for row in far]
+
+
+def summary(report: dict[str, Any], width: int = 100) -> str:
+    """What a person reads first, in lines of at most `width` characters."""
+    lines = [title(report), *lead(report), *report["log_doubts"], *report["advice"]]
+    if report["noise_sentence"] is not None:
+        lines.append(f"noise: {report['noise_sentence']}")
+    lines += ["", f"verdict: {report['verdict']} - {report['reason']}",
+              f"asked: {report['question']}; {report['remark']}"]
+    for one in report["effects"]:
+        lines += [f"  {name} = {p['value']:.4g} [{p['interval'][0]:.4g}, {p['interval'][1]:.4g}] {p['unit']}"
+                  for name, p in one["parameters"].items()]
+        lines += [f"  {text}" for text in not_determined(one["parameters"])]
+    if report["floor"] is not None and report["floor"]["sentence"]:
+        lines.append(f"  changed: {report['floor']['sentence']}")
+    moved = shifts(report["base"])
+    if moved:
+        lines += ["  base parameters further than from day to day:", *(f"    {one}" for one in moved)]
+    if report["next_manoeuvre"] is not None:
+        lines.append(f"  next drive: {sentence(report['next_manoeuvre'])}")
+    for one in report["lives_in"][:4]:
+        lines.append(f"  lives in {one['quantity']}: {one['share']:.0%} of what is left")
+    if report["unnamed"] is not None:
+        lines.append(f"  {describe_unnamed(report['unnamed'])}")
+    return "\n".join(wrapped(line, width) for line in lines)
+
+
+def wrapped(line: str, width: int) -> str:
+    """A line folded at `width`; what follows is indented by two more."""
+    indent = " " * (len(line) - len(line.lstrip()))
+    return textwrap.fill(line.strip(), width, initial_indent=indent, subsequent_indent=f"{indent}  ",
+                         break_long_words=False, break_on_hyphens=False) if line.strip() else ""

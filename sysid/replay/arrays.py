@@ -1,4 +1,4 @@
-"""NumPy or, under a trace, JAX for an array; and points by whose differences slopes are found."""
+"""NumPy or, under a trace, JAX for an array; quaternions; and points by whose differences slopes are found."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -21,6 +22,23 @@ def added(array: Any, index: Any, part: Any) -> Any:
         array[index] += part
         return array
     return array.at[index].add(part)
+
+
+def rotated(quaternion: Any, vector: Any) -> Any:
+    """A vector (3,) turned by quaternions (..., 4) of w, x, y, z."""
+    np_ = namespace(quaternion)
+    cross = 2 * np_.cross(quaternion[..., 1:], vector)
+    return vector + quaternion[..., :1] * cross + np_.cross(quaternion[..., 1:], cross)
+
+
+def quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Rotation b, then a (w, x, y, z)."""
+    return jnp.stack([
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ])
 
 
 @dataclass(frozen=True)

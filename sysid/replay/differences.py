@@ -36,6 +36,7 @@ from sysid.replay.rollout import PathReplay, Replay, make_batch
 VECTOR, FEW, MANY = 8, 32, 128
 """Drives that a core replays together fill its vectors, of so many numbers (20 take longer than 24), and are about so
 many for a few parameter sets, and for many: 1.7 ms a drive of 22 s with 32, 1.3 ms with 112, and no less with more."""
+AROUND = 0.1  # s, over which the speeds at the begin of a piece are averaged
 SETS = 4  # parameter sets together at least where courses alone fill vectors: as many as a search tries at once
 
 
@@ -85,7 +86,7 @@ class CourseReplay:
         if count < 2 or batch.warm_up or not self._anywhere or isinstance(self._replay, HostReplay):
             return self
         times = pieces.begins(records, count) * step - pieces.OVERLAP
-        speeds = np.stack([pieces.speeds_at(trial, times) for trial in self._trials])
+        speeds = np.stack([speeds_at(trial, times) for trial in self._trials])
         other = copy(self)
         other._traced = self._replay.on(replace(batch, speeds=jnp.asarray(speeds, jnp.result_type(float))))
         other.drives = count * self.courses
@@ -217,3 +218,15 @@ def make_replay(
         courses = CourseReplay(plant, trials, put, anywhere=not params.room_fixed, paths=paths)
         measured = courses.measured
     return DifferenceReplay(courses, space), measured
+
+
+def speeds_at(trial: Trial, times: np.ndarray) -> np.ndarray:
+    """(W, 2) speeds that the odometry reports at times (W,) of a trial, or those commanded where it reports none."""
+    found = trial.commanded(times).T
+    found[times <= 0] = trial.start.v, trial.start.omega
+    if trial.odometry is not None:
+        for i, time in enumerate(times):
+            near = np.abs(trial.odometry.t - time) < AROUND
+            if time > 0 and near.any():
+                found[i] = trial.odometry.v[near].mean(), trial.odometry.omega[near].mean()
+    return found

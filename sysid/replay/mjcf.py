@@ -27,6 +27,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from sysid.replay.arrays import quaternion_product, rotated
 from sysid.replay.models import Bounds, Model, Parameters, Twin, make_parameters, with_surroundings
 from sysid.replay.records import Plant
 from sysid.replay.robot import Robot
@@ -36,7 +37,6 @@ from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, r
 from sysid.replay.robot_rest import FALLS
 from sysid.replay.robot_sizes import SIZES, Size, sizes_of
 from sysid.replay.robot_vehicle import vehicle_of
-from sysid.replay.rollout import quaternion_product
 from whill_mjx.processor import shares_results
 from whill_mjx.vehicle.model import import_mjx
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -186,7 +186,7 @@ class Stepped:
         arm = qpos[root : root + 3] - where
         velocity = jnp.stack([v * jnp.cos(heading) - omega * arm[1], v * jnp.sin(heading) + omega * arm[0], 0 * v])
         inverse = qpos[root + 3 : root + 7] * jnp.array([1.0, -1.0, -1.0, -1.0])
-        rate = _rotate(inverse, jnp.stack([0 * v, 0 * v, omega]))
+        rate = rotated(inverse, jnp.stack([0 * v, 0 * v, omega]))
         qvel = qvel.at[speed : speed + 3].set(velocity).at[speed + 3 : speed + 6].set(rate)
         qvel = qvel.at[self.wheels].set(self.sign * self._wheel_speeds(v, omega))
         return Motion(qpos, qvel, self.activation, jnp.zeros(self.robot.host.nv, self.float_type))
@@ -232,8 +232,8 @@ class Stepped:
         """Reference point (3,) and heading ()."""
         root = self.robot.root
         quaternion = qpos[root + 3 : root + 7]
-        forward = _rotate(quaternion, self.ahead)
-        return qpos[root : root + 3] + _rotate(quaternion, self.point), jnp.arctan2(forward[1], forward[0])
+        forward = rotated(quaternion, self.ahead)
+        return qpos[root : root + 3] + rotated(quaternion, self.point), jnp.arctan2(forward[1], forward[0])
 
     def _at(self, qpos: jax.Array, qvel: jax.Array, start: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The motion turned and moved so that the reference point is at the start."""
@@ -241,11 +241,11 @@ class Stepped:
         where, heading = self._pose(qpos)
         turn = start[2] - heading
         spin = jnp.stack([jnp.cos(turn / 2), 0 * turn, 0 * turn, jnp.sin(turn / 2)])
-        arm = _rotate(spin, qpos[root : root + 3] - where)
+        arm = rotated(spin, qpos[root : root + 3] - where)
         origin = jnp.stack([start[0] + arm[0], start[1] + arm[1], qpos[root + 2]])
         attitude = quaternion_product(spin, qpos[root + 3 : root + 7])
         qpos = qpos.at[root : root + 3].set(origin).at[root + 3 : root + 7].set(attitude)
-        return qpos, qvel.at[speed : speed + 3].set(_rotate(spin, qvel[speed : speed + 3]))
+        return qpos, qvel.at[speed : speed + 3].set(rotated(spin, qvel[speed : speed + 3]))
 
 
 def _may_abort(host: mujoco.MjModel) -> bool:
@@ -253,9 +253,3 @@ def _may_abort(host: mujoco.MjModel) -> bool:
     kinds = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH
     touching = (host.geom_contype | host.geom_conaffinity) > 0
     return bool(np.isin(host.geom_type[touching], [int(kind) for kind in kinds]).any())
-
-
-def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """Vector (3,) turned by a quaternion (w, x, y, z)."""
-    cross = jnp.cross(quaternion[1:], vector) * 2
-    return vector + quaternion[0] * cross + jnp.cross(quaternion[1:], cross)

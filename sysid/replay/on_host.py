@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.replay.delays import delay_apart, delayed
+from sysid.replay.one_drive import from_reference, simulate_one
 from sysid.replay.records import Batch, Plant, Simulated
-from sysid.replay.rollout import simulate_one
 
 FEW, MANY = 4, 32
 """Parameter sets whose commands and readings are computed together: each other number would be compiled."""
@@ -34,9 +34,8 @@ class HostReplay:
         def before(values: jax.Array, one: Batch) -> tuple[Any, Any, jax.Array, jax.Array]:
             """Values of the model, its state at the start, commands (S, 2) of every physics step, and where it starts:
             at the origin where that does not matter, so that sets which differ in readings alone share a drive."""
-            params, start = set_values(values), one.start
-            for effect in params.effects:
-                start = effect.reference(start) if hasattr(effect, "reference") else start
+            params = set_values(values)
+            start = from_reference(params, one.start)
             begin = start if params.room_fixed else start.at[:3].set(0.0)
             command = one.command.reshape(-1, 2)
             if one.warm_up:  # it came with these
@@ -46,9 +45,8 @@ class HostReplay:
             return params.values, host.place(params, begin), host.commands(params, command), begin
 
         def after(values: jax.Array, one: Batch, motion: jax.Array) -> Simulated:
-            params, start = set_values(values), one.start
-            for effect in params.effects:
-                start = effect.reference(start) if hasattr(effect, "reference") else start
+            params = set_values(values)
+            start = from_reference(params, one.start)
             motion = motion if params.room_fixed else _moved(motion, start)
             kept = tuple(effect for effect in params.effects if not hasattr(effect, "command"))
             motion = motion.reshape(*one.command.shape[:2], -1)

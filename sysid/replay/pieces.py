@@ -13,13 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.records import Trial, command_in_force
-
 LENGTH = 2.75  # s, of a piece
 OVERLAP = 2.0
 """Time that is replayed before each [s]: whitened motion differs by 0.2 of its noise (0.05 with 3 s, 0.3 with 1.5 s).
 """
-AROUND = 0.1  # s, over which the speeds at the begin of a piece are averaged
 
 
 def count(duration: float) -> int:
@@ -30,20 +27,6 @@ def count(duration: float) -> int:
 def begins(records: int, pieces: int) -> np.ndarray:
     """(W,) records at which pieces begin, evenly."""
     return np.arange(pieces) * -(-records // pieces)
-
-
-def speeds_at(trial: Trial, times: np.ndarray) -> np.ndarray:
-    """(W, 2) speeds that the odometry reports at times (W,) of a trial, or those commanded where it reports none."""
-    held = command_in_force(trial.command, times)
-    found = np.stack([np.where(held >= 0, speed[held], first) for speed, first in (
-        (trial.command.v, trial.start.v), (trial.command.omega, trial.start.omega))], axis=-1)
-    found[times <= 0] = trial.start.v, trial.start.omega
-    if trial.odometry is not None:
-        for i, time in enumerate(times):
-            near = np.abs(trial.odometry.t - time) < AROUND
-            if time > 0 and near.any():
-                found[i] = trial.odometry.v[near].mean(), trial.odometry.omega[near].mean()
-    return found
 
 
 def record(

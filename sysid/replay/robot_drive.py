@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from sysid.replay.arrays import rotated
 from sysid.replay.cores import cores
 from sysid.replay.robot import Robot
 from sysid.replay.robot_parameters import Entry, Overlaid
@@ -89,8 +90,8 @@ class RobotDrive:
         """(..., 5) x, y, yaw of the reference point, v and omega of the wheels."""
         robot = self._robot
         quaternion = qpos[..., robot.root + 3 : robot.root + 7]
-        where = qpos[..., robot.root : robot.root + 3] + _rotated(quaternion, robot.point)
-        forward = _rotated(quaternion, robot.forward)
+        where = qpos[..., robot.root : robot.root + 3] + rotated(quaternion, robot.point)
+        forward = rotated(quaternion, robot.forward)
         rims = np.array(robot.sign) * qvel[..., list(robot.wheels)] * robot.wheel_radius
         left, right = (rims[..., robot.sides == side].mean(-1) for side in (0, 1))
         yaw = np.arctan2(forward[..., 1], forward[..., 0])
@@ -139,9 +140,3 @@ def _from(seen: np.ndarray, first: int, starts: np.ndarray) -> np.ndarray:
     later[..., 1] = starts[..., 1, None] + sin * x + cos * y
     later[..., 2] += turn
     return later
-
-
-def _rotated(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """A vector (3,) turned by quaternions (..., 4) of w, x, y, z."""
-    cross = 2 * np.cross(quaternion[..., 1:], vector)
-    return vector + quaternion[..., :1] * cross + np.cross(quaternion[..., 1:], cross)

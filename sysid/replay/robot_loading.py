@@ -23,7 +23,7 @@ from sysid.replay.robot_servos import (
     is_stable,
     regulate,
     wheel_inertias,
-)
+)  # fmt: skip
 from sysid.replay.wheels import as_plain_wheels, wheel_joints
 from whill_mjx.io.fields import Field, check
 

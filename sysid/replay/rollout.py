@@ -2,8 +2,7 @@
 
 Commands are resampled to the physics grid (each holds until the next), trials are padded to one length with masks, the
 motion is recorded every few steps and interpolated at the measurements' times. The vehicle is a few functions of one
-instance (`Plant`). A trial that starts in motion first drives a while at the start's wheel speeds, so that controller,
-delays and slip are those of a vehicle under way, and is then moved to the start pose.
+instance (`Plant`).
 """
 
 from __future__ import annotations
@@ -12,32 +11,36 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial, command_in_force
-from sysid.replay import pieces
+from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial
+from sysid.replay.arrays import quaternion_product
 from sysid.replay.cores import on_all_cores, on_processor
-from sysid.replay.delays import delay_apart, delayed, framed, late, reached, without
-from sysid.replay.records import ODOMETRY, POSE, RECORD_DT, SPEEDS, TURN, YAW_COLUMNS, Batch, Measured, Plant, Simulated
-from whill_mjx.effects.odometry_lag import OdometryLag
-from whill_mjx.effects.sensor_delay import SensorDelay
+from sysid.replay.delays import delay_apart
+from sysid.replay.one_drive import (
+    IN_ONE,
+    WARM_UP,
+    Commanded,
+    advance,
+    as_sensed,
+    begun_drive,
+    from_reference,
+    own_effects,
+    path_of,
+    simulate_one,
+)  # fmt: skip
+from sysid.replay.records import RECORD_DT, Batch, Measured, Plant, Simulated
 from whill_mjx.processor import as_one_function
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
 
-WARM_UP = 1.5  # s of driving at the start speeds before a trial that starts in motion
-WARM_UP_GAIN = 3.0  # 1/s, of the correction that brings the odometry to the start speeds in that time
 FETCHED = 512  # rows by which what an accelerator sends back grows: each size is compiled once
-IN_ONE = 256
-"""Drives at most that one function computes: with 128 it takes 0.7 ms for each of 22 s where many functions take 1.1,
-with 512 they take 1.5 and 0.8, for those divide loops among the cores; within one XLA fails to (seen with 1024)."""
 ROOMS = (512, 1024, 2048, 4096)
 """Records for which one program has room, up to 41 s; longer drives have programs for multiples of the last."""
-UNROLLED = 2  # steps between records at most that `Plant.record` takes: compiling it takes as long as it has steps
 
 
 def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Plant:
@@ -81,16 +84,6 @@ def vehicle_plant(spec: VehicleSpec, config: VehicleConfig | None = None) -> Pla
                  lambda params, state, commands: record(model, params, state, commands, observe), arithmetic=True)
 
 
-def quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Rotation b, then a (w, x, y, z)."""
-    return jnp.stack([
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ])
-
-
 def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_DT) -> tuple[Batch, Measured]:
     """Resample and pad trials; ValueError when there is none."""
     if not trials:
@@ -104,17 +97,15 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     odometry_t, odometry, odometry_mask = padded([trial.odometry for trial in trials], 5)
     pose_index, pose_weight = _grid(pose_t, record, records)
     odometry_index, odometry_weight = _grid(odometry_t, record, records)
-    floats = [command.reshape(len(trials), records, stride, 2), start]
-    floats_type = jnp.result_type(float)
-    command_array, start_array = (jnp.asarray(array, floats_type) for array in floats)
-    batch = Batch(command_array, start_array, jnp.asarray(pose_index), jnp.asarray(pose_weight, jnp.result_type(float)),
-                  jnp.asarray(odometry_index), jnp.asarray(odometry_weight, jnp.result_type(float)),
+    floats = partial(jnp.asarray, dtype=jnp.result_type(float))
+    batch = Batch(floats(command.reshape(len(trials), records, stride, 2)), floats(start), jnp.asarray(pose_index),
+                  floats(pose_weight), jnp.asarray(odometry_index), floats(odometry_weight),
                   warm_up=round(WARM_UP / dt) if start[:, 3:].any() else 0)
     if all(trial.gyro is None for trial in trials):
         return batch, Measured(pose, pose_mask, odometry, odometry_mask)
     gyro_t, gyro, gyro_mask = padded([trial.gyro for trial in trials], 1)
     gyro_index, gyro_weight = _grid(gyro_t, record, records)
-    batch = replace(batch, gyro_index=jnp.asarray(gyro_index), gyro_weight=jnp.asarray(gyro_weight, floats_type))
+    batch = replace(batch, gyro_index=jnp.asarray(gyro_index), gyro_weight=floats(gyro_weight))
     return batch, Measured(pose, pose_mask, odometry, odometry_mask, gyro, gyro_mask, gyro_t)
 
 
@@ -204,101 +195,6 @@ def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Predict
     return results
 
 
-class Commanded(NamedTuple):
-    """One drive that is to be replayed."""
-
-    command: jax.Array  # (R, K, 2) in force in each of K physics steps between records [m/s, rad/s]
-    start: jax.Array  # (5,) x, y, yaw, v, omega
-    warm_up: int = 0  # physics steps at the start's speeds before it
-    speeds: jax.Array | None = None  # (W, 2) where pieces begin, to replay it in these (`sysid.replay.pieces`)
-
-
-def path_of(plant: Plant, params: Any, commanded: Commanded, few: bool = False, gyro: bool = False) -> jax.Array:
-    """States (R + 1, 9) at the records, as `Plant.observe` gives them, of one drive; with a gyro's turn [rad] (R + 1,
-    10).
-
-    `few`: `IN_ONE` drives at most are computed side by side: by one function, if the plant is `arithmetic`.
-    """
-    commanded = _from_reference(params, commanded)
-    path = _driven(plant, _driving(plant, params), commanded, few)
-    return _as_sensed(plant, params, commanded, path, gyro)
-
-
-def _driving(plant: Plant, params: Any) -> Any:
-    """The vehicle without effects that `_as_sensed` applies to the whole drive."""
-    params, _ = without(params, SensorDelay.name)
-    return without(params, OdometryLag.name)[0] if plant.frame else params
-
-
-def _from_reference(params: Any, commanded: Commanded) -> Commanded:
-    """The drive from where the vehicle's reference point starts; logs give that of a tracked point."""
-    for effect in getattr(params, "effects", ()):
-        if hasattr(effect, "reference"):
-            commanded = commanded._replace(start=effect.reference(commanded.start))
-    return commanded
-
-
-def _as_sensed(plant: Plant, params: Any, commanded: Commanded, path: jax.Array, gyro: bool) -> jax.Array:
-    """What sensors make of the states (R + 1, 9) of a drive; arguments as of `path_of`."""
-    params, latency = without(params, SensorDelay.name)
-    params, lag = without(params, OdometryLag.name) if plant.frame else (params, None)
-    gap = plant.dt * commanded.command.shape[1]
-    turns = jax.lax.stop_gradient(_turns(commanded.start[2] - path[0, 2]))
-    for column in YAW_COLUMNS:
-        path = path.at[:, column].set(_unwrap(path[:, column]))
-    if lag is not None and plant.frame:
-        path = path.at[:, SPEEDS].set(framed(path[:, SPEEDS], lag.time_constant, plant.frame, gap))
-    turned = path[:, 2]
-    for effect in getattr(params, "effects", ()):
-        if hasattr(effect, "turned"):
-            turned = effect.turned(turned, gap)
-    if latency is not None:
-        path = path.at[:, ODOMETRY].set(late(path[:, ODOMETRY], latency, gap))
-    for effect in getattr(params, "effects", ()):
-        if hasattr(effect, "outside"):
-            path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
-    # The measured yaw may count full turns from another origin than the simulated one.
-    path = path.at[:, 2].add(turns)
-    return jnp.concatenate([path, turned[:, None]], axis=1) if gyro else path
-
-
-def _driven(plant: Plant, params: Any, commanded: Commanded, few: bool) -> jax.Array:
-    """States (R + 1, 9) of the drive, before what sensors make of them."""
-    command, start, warm_up, speeds = commanded
-    vehicle, _ = delay_apart(params)
-    in_one = as_one_function if few and plant.arithmetic else lambda function: function
-
-    def after(state: Any, commands: jax.Array) -> tuple[Any, jax.Array]:
-        state = _advance(plant, vehicle, state, commands)
-        return state, plant.observe(state)
-
-    def drive(start: jax.Array, command: jax.Array) -> jax.Array:
-        state, command = _begun(plant, params, command, start, warm_up)
-        if plant.record is None or on_processor() or command.shape[1] > UNROLLED:
-            later = in_one(partial(jax.lax.scan, after))(state, command)[1]
-        else:
-            later = plant.record(vehicle, state, command)
-        return jnp.concatenate([plant.observe(state)[None], later])
-
-    if speeds is None:
-        return drive(start, command)
-    begin, gap = ((POSE, start[:3]), (slice(3, 6), jnp.zeros_like(start[:3]))), plant.dt * command.shape[1]
-    path = pieces.record(drive, command, start, speeds, round(pieces.OVERLAP / gap), begin)
-    return path.at[-1, 8].set(path[:, 8].max())
-
-
-def _begun(
-    plant: Plant, params: Any, command: jax.Array, start: jax.Array, warm_up: int
-) -> tuple[Any, jax.Array]:
-    """State at the start (5,) of a drive, and the commands (R, K, 2) as the vehicle's delay lets them come."""
-    params, delay = delay_apart(params)
-    state, before = plant.place(params, start), None
-    if warm_up:
-        state, before = _settle(plant, params, state, start[3:], warm_up, command.shape[1])
-        state = plant.move(state, start)
-    return state, delayed(delay, command, plant.dt, before)
-
-
 class _Programs:
     """`path_of` for rows of drives in three programs; the large one serves drives of any length (`ROOMS`)."""
 
@@ -307,20 +203,20 @@ class _Programs:
 
         def begin(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int) -> tuple[Any, jax.Array]:
             params = set_values(values)
-            commanded = _from_reference(params, Commanded(command, start))
-            state, command = _begun(plant, _driving(plant, params), command, commanded.start, warm_up)
+            start = from_reference(params, start)
+            state, command = begun_drive(plant, own_effects(plant, params), command, start, warm_up)
             room = next((room for room in ROOMS if room >= len(command)), -(-len(command) // ROOMS[-1]) * ROOMS[-1])
             spare = jnp.zeros((room - len(command), *command.shape[1:]), command.dtype)
             return state, jnp.concatenate([command, spare])
 
         def drive(values: jax.Array, state: Any, command: jax.Array, count: jax.Array) -> jax.Array:
-            vehicle, _ = delay_apart(_driving(plant, set_values(values)))
+            vehicle, _ = delay_apart(own_effects(plant, set_values(values)))
             first = plant.observe(state)
             path = jnp.concatenate([first[None], jnp.zeros((len(command), len(first)), first.dtype)])
 
             def after(number: jax.Array, carry: tuple[Any, jax.Array]) -> tuple[Any, jax.Array]:
                 state, path = carry
-                state = _advance(plant, vehicle, state, command[number])
+                state = advance(plant, vehicle, state, command[number])
                 return state, path.at[number + 1].set(plant.observe(state))
 
             def steps(state: Any, path: jax.Array, count: jax.Array) -> jax.Array:
@@ -330,8 +226,8 @@ class _Programs:
 
         def finish(values: jax.Array, path: jax.Array, command: jax.Array, start: jax.Array, gyro: bool) -> jax.Array:
             params = set_values(values)
-            commanded = _from_reference(params, Commanded(command, start))
-            return _as_sensed(plant, params, commanded, path[: len(command) + 1], gyro)
+            commanded = Commanded(command, from_reference(params, start))
+            return as_sensed(plant, params, commanded, path[: len(command) + 1], gyro)
 
         self._begin = jax.jit(jax.vmap(begin, in_axes=(0, 0, 0, None)), static_argnums=3)
         self._drive = jax.jit(jax.vmap(drive, in_axes=(0, 0, 0, None)))
@@ -382,62 +278,9 @@ class PathReplay:
         return np.concatenate(parts)[:count]
 
 
-def simulate_one(plant: Plant, params: Any, one: Batch, few: bool = False) -> Simulated:
-    """Replay one trial of a batch with one parameter set."""
-    commanded = Commanded(one.command, one.start, one.warm_up, one.speeds)
-    path = path_of(plant, params, commanded, few, one.gyro_index is not None)
-
-    def at(index: jax.Array, weight: jax.Array, columns: slice) -> jax.Array:
-        before, after = path[index, columns], path[index + 1, columns]
-        return before + weight[:, None] * (after - before)
-
-    turned = None
-    if one.gyro_index is not None and one.gyro_weight is not None:
-        turned = at(one.gyro_index, one.gyro_weight, TURN)
-    return Simulated(at(one.pose_index, one.pose_weight, POSE), at(one.odometry_index, one.odometry_weight, ODOMETRY),
-                     path[-1, 8], turned)
-
-
-def _advance(plant: Plant, params: Any, state: Any, commands: jax.Array) -> Any:
-    """State after K physics steps, each with its own of commands (K, 2)."""
-    if plant.substeps is not None:
-        return plant.substeps(params, state, commands)
-    return jax.lax.scan(lambda state, command: (plant.substep(params, state, command), None), state, commands)[0]
-
-
-def _settle(
-    plant: Plant, params: Any, state: Any, speeds: jax.Array, steps: int, held: int
-) -> tuple[Any, jax.Array]:
-    """State after driving so that the odometry reports `speeds` (2,), and the command (2,) that does it, raised where
-    the vehicle falls short of its command, as a skid-steered one does. Effects on commands have reached what they make
-    of it at once: a lag or limit that began at rest would last longer than this."""
-    params = reached(params)
-
-    def body(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], None]:
-        state, command = carry
-        state = _advance(plant, params, state, jnp.broadcast_to(command, (held, 2)))
-        return (state, command + WARM_UP_GAIN * held * plant.dt * (speeds - plant.observe(state)[SPEEDS])), None
-
-    return jax.lax.scan(body, (state, speeds), None, length=max(steps // held, 1))[0]
-
-
-def _turns(angle: jax.Array) -> jax.Array:
-    return 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
-
-
-def _unwrap(angle: jax.Array) -> jax.Array:
-    """Angle (T,) without jumps; the full turns are constants to differentiation."""
-    jumps = jax.lax.stop_gradient(_turns(jnp.diff(angle)))
-    return angle - jnp.concatenate([jnp.zeros(1, angle.dtype), jnp.cumsum(jumps)])
-
-
 def _held_commands(trial: Trial, steps: int, dt: float) -> np.ndarray:
     """(S, 2) command in force in the middle of each physics step; before the first command the start's speeds hold."""
-    middle = (np.arange(steps) + 0.5) * dt
-    held = command_in_force(trial.command, middle)
-    v = np.where(held >= 0, trial.command.v[held], trial.start.v)
-    omega = np.where(held >= 0, trial.command.omega[held], trial.start.omega)
-    return np.stack([v, omega], axis=-1)
+    return trial.commanded((np.arange(steps) + 0.5) * dt).T
 
 
 def _grid(t: np.ndarray, record: float, records: int) -> tuple[np.ndarray, np.ndarray]:
@@ -464,5 +307,3 @@ def padded(
 
 def _table(stream: PoseStream | OdometryStream | GyroStream | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
     return (np.zeros(0), np.zeros((0, columns))) if stream is None else (stream.t, stream.values)
-
-

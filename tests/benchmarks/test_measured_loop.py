@@ -8,17 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.measured_loop import (
-    Benchmark,
-    climb,
-    config_of,
-    drive_log,
-    interval,
-    is_false,
-    keep,
-    of_terrain,
-    run_log,
-)
+from benchmarks.measured_floors import run_log
+from benchmarks.measured_loop import climb, is_false, of_terrain
 from benchmarks.measured_peers import (
     Steps,
     all_values,
@@ -31,6 +22,7 @@ from benchmarks.measured_peers import (
     sides,
     steps_of,
 )
+from benchmarks.measured_verdicts import Benchmark, config_of, drive_log, interval, keep
 from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from sysid.replay.models import with_effects
 from whill_mjx.vehicle.presets import preset_params

@@ -35,7 +35,7 @@ def command(v):
 
 
 def read(path):
-    from sysid.logs.rosbag import read_bag
+    from sysid.logs.bags.reader import read_bag
 
     return read_bag(path).streams
 

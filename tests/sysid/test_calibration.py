@@ -26,10 +26,11 @@ from sysid.replay.mjcf import mjcf_model
 from sysid.replay.model_files import load_model
 from sysid.replay.models import set_parameters, with_effects
 from sysid.replay.on_host import HostReplay
+from sysid.replay.one_drive import Commanded, path_of
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import drive_entries
-from sysid.replay.rollout import Commanded, Replay, make_batch, path_of, vehicle_plant
+from sysid.replay.rollout import Replay, make_batch, vehicle_plant
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log, make_problem
 from sysid.search.settings import FitConfig

@@ -21,7 +21,9 @@ from sysid.logs.metrics import own_floor, score
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
 from sysid.missing.joint_fit import without_each
-from sysid.pages.loop_report import effects, make_report, manifest, replay, shifts, write_run
+from sysid.pages.loop_errors import replay
+from sysid.pages.loop_report import effects, make_report, manifest, write_run
+from sysid.pages.loop_words import shifts
 from sysid.replay.models import with_effects
 from sysid.replay.records import Measured
 from sysid.replay.rollout import vehicle_plant
@@ -355,10 +357,11 @@ def test_everything_fixed_beforehand_is_in_the_manifest(sloping):
     assert json.dumps(other, default=str) != json.dumps(written, default=str)
 
 
-def test_the_command_writes_the_run(sloping, folder, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_the_run(sloping, report, folder, tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr("sysid.verdict.pipeline.find_missing",
                         lambda *given: asked.append(given) or sloping)
+    monkeypatch.setattr("sysid.pages.loop_report.make_report", lambda result: report if result is sloping else None)
     report = main(Arguments(dataset=folder / "sloping", reference=(folder / "reference_1",), out=tmp_path / "run"))
     [(log, references, config, vehicle, _)] = asked
     assert (log.name, [one.name for one in references], vehicle) == ("sloping", ["reference_1"], None)
@@ -459,7 +462,8 @@ def test_an_accelerator_replays_the_same_in_large_calls(sloping, monkeypatch):
     every = np.arange(len(made.trials))
     values = np.array([list(base_values(sloping.full).values())] * len(every))
     usual = sloping.prepared.paths(values, made.batch, every)
-    monkeypatch.setattr("sysid.replay.rollout.on_processor", lambda: False)
+    for module in ("rollout", "one_drive"):
+        monkeypatch.setattr(f"sysid.replay.{module}.on_processor", lambda: False)
     monkeypatch.setattr("sysid.replay.rollout.FETCHED", 2)
     large = copy.copy(sloping.prepared.paths)
     for large.rows in (len(every) - 2, len(every) + 5):  # the second one has rows to spare, of which one is fetched

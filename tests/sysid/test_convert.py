@@ -16,14 +16,15 @@ from rosbags.rosbag2.reader import zstd
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import sysid.convert as convert_module
+from sysid.logs.bags.recording import CHAIR_STATE
+from sysid.logs.bags.wheel_states import CHAIR_DEFINITION, JOYSTICK_FIELDS
 from sysid.logs.conversion import ConvertConfig, convert
-from sysid.logs.inspection import load_whole
 from sysid.logs.log import load_log, make_trial
-from sysid.logs.measured import load_any, load_drive
+from sysid.logs.measured import load_any, load_whole
+from sysid.logs.planar import yaw_of
+from sysid.logs.published.drive_norlab import load_drive
 from sysid.logs.records import Command, OdometryStream, PoseStream
-from sysid.logs.rosbag import yaw_of
 from sysid.logs.sources import refuse_recording
-from sysid.logs.wheel_states import CHAIR_DEFINITION, CHAIR_STATE, JOYSTICK_FIELDS
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)

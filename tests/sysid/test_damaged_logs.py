@@ -21,10 +21,11 @@ from sysid.design import load_subject
 from sysid.errors.features import CHANNELS
 from sysid.errors.noise import ROUGH, Whitener
 from sysid.logs import lerobot
+from sysid.logs.bags.reader import read_bag
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log, read_csv
-from sysid.logs.measured import load_drive, load_mrclam
-from sysid.logs.rosbag import read_bag
+from sysid.logs.published.drive_norlab import load_drive
+from sysid.logs.published.mrclam import load_mrclam
 from sysid.missing.fit_statistics import FitStatistics, Leftovers, load_fitted
 from sysid.pages.report import read_report, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, load, save

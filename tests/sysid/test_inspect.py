@@ -19,8 +19,9 @@ from sysid.errors.space import make_space
 from sysid.inspect import InspectConfig, main
 from sysid.logs import replicates
 from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity, sign_changes
-from sysid.logs.inspection import inspect, load_whole, text
+from sysid.logs.inspection import inspect, text
 from sysid.logs.log import load_log
+from sysid.logs.measured import load_whole
 from sysid.logs.metrics import ideal_replay
 from sysid.logs.next_drives import next_drives
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of, with_timeout

@@ -16,7 +16,8 @@ from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import no_wander
 from sysid.missing.joint_fit import Start as JointStart
 from sysid.missing.signatures import manoeuvre_groups
-from sysid.replay.rollout import Commanded, make_batch, path_of
+from sysid.replay.one_drive import Commanded, path_of
+from sysid.replay.rollout import make_batch
 from sysid.verdict import alone
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
 from sysid.verdict.found import Candidate, Effort

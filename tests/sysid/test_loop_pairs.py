@@ -11,7 +11,7 @@ from sysid.follow_up.power import SEED, Days, false_alarms, power_curve
 from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit, moved_last
-from sysid.pages.loop_report import detectable
+from sysid.pages.loop_power import detectable
 from sysid.verdict.found import tail
 from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
 from sysid.verdict.posterior import Thresholds
@@ -135,7 +135,7 @@ def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, mo
     evidence = drives(np.zeros(4))
     scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
     days = simulated_days(evidence, wander, scan)
-    monkeypatch.setattr("sysid.pages.loop_report.base_values", lambda _: dict.fromkeys(
+    monkeypatch.setattr("sysid.pages.loop_power.base_values", lambda _: dict.fromkeys(
         (one.axes[0].parameter for one in EFFECTS), 0.0))
     result = SimpleNamespace(search=SimpleNamespace(scan=scan, findings=None), evidence=evidence, hypotheses=EFFECTS,
                              full=None, prepared=SimpleNamespace(wander=wander),

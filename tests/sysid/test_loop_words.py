@@ -7,8 +7,7 @@ import pytest
 
 from sysid.logs.manoeuvre_library import OWN
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
-from sysid.pages.loop_report import wrapped
-from sysid.pages.loop_words import MANOEUVRE_WORDS, lead, sentence, size, title
+from sysid.pages.loop_words import MANOEUVRE_WORDS, lead, sentence, size, title, wrapped
 
 pytestmark = pytest.mark.quick
 

@@ -12,10 +12,10 @@ from sysid.logs.coverage import doubts, sanity
 from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
 from sysid.logs.metrics import CHANNELS
+from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 from sysid.logs.streams import clock_shift, response_shift
 from sysid.logs.unusable import stood, without_standing
-from sysid.logs.wheel_states import integrate_speeds
 from sysid.logs.windows import WINDOW, in_windows
 from whill_mjx.vehicle.specs import WHILL_CR
 

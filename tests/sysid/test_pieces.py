@@ -13,7 +13,7 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 from sysid.errors import bin_objective
 from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
-from sysid.replay import pieces, rollout
+from sysid.replay import differences, one_drive, pieces, rollout
 from sysid.replay.differences import CourseReplay, DifferenceReplay
 from sysid.search import least_squares
 from sysid.search.valleys import from_all
@@ -60,7 +60,7 @@ def test_a_drive_of_which_a_piece_diverges_has_diverged(short_pieces):
     records = round(5.0 / plant.dt)
     command = jnp.zeros((records, 1, 2)).at[: records // 2, :, 0].set(1.0)  # at rest again in the end
     for speeds, expected in ((None, 0.0), (jnp.zeros((5, 2)), 1.0)):
-        path = rollout.path_of(quick, TRUTH, rollout.Commanded(command, jnp.zeros(5), speeds=speeds))
+        path = one_drive.path_of(quick, TRUTH, one_drive.Commanded(command, jnp.zeros(5), speeds=speeds))
         assert path[:, 8].max() == 1.0 and path[-1, 8] == expected
 
 
@@ -75,12 +75,12 @@ def test_some_drives_stay_whole(unicycle_log, why):
 def test_pieces_begin_at_the_speeds_that_were_measured(unicycle_log):
     trial = unicycle_log.training[0]
     times = np.array([-1.0, 1.5, 2.5])
-    speeds = pieces.speeds_at(trial, times)
+    speeds = differences.speeds_at(trial, times)
     assert not speeds[0].any()
     for time, found in zip(times[1:], speeds[1:], strict=True):
         near = np.abs(trial.odometry.t - time) < 0.15
         assert trial.odometry.v[near].min() <= found[0] <= trial.odometry.v[near].max()
-    unseen = pieces.speeds_at(dataclasses.replace(trial, odometry=None), times)
+    unseen = differences.speeds_at(dataclasses.replace(trial, odometry=None), times)
     held = np.searchsorted(trial.command.t, times[1:], side="right") - 1
     np.testing.assert_allclose(unseen[1:, 0], trial.command.v[held])
 
@@ -103,8 +103,8 @@ def test_a_vehicle_is_recorded_the_same_on_an_accelerator(monkeypatch):
     plant = rollout.vehicle_plant(WHILL_CR, VehicleConfig(physics_dt=0.005))
     params = preset_params(WHILL_CR, "physical")
     command = jnp.asarray(np.cumsum(np.random.default_rng(0).normal(0, 0.05, (60, 2, 2)), axis=0), jnp.float32)
-    expected = jax.jit(lambda c: rollout.path_of(plant, params, rollout.Commanded(c, jnp.zeros(5))))(command)
-    monkeypatch.setattr(rollout, "on_processor", lambda: False)
-    found = jax.jit(lambda c: rollout.path_of(plant, params, rollout.Commanded(c, jnp.zeros(5))))(command)
+    expected = jax.jit(lambda c: one_drive.path_of(plant, params, one_drive.Commanded(c, jnp.zeros(5))))(command)
+    monkeypatch.setattr(one_drive, "on_processor", lambda: False)
+    found = jax.jit(lambda c: one_drive.path_of(plant, params, one_drive.Commanded(c, jnp.zeros(5))))(command)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(found, expected, atol=1e-5)

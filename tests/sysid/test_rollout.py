@@ -63,7 +63,8 @@ def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
     import jax
     import jax.numpy as jnp
 
-    from sysid.replay.rollout import Commanded, path_of, vehicle_plant
+    from sysid.replay.one_drive import Commanded, path_of
+    from sysid.replay.rollout import vehicle_plant
     from whill_mjx.effects import make_effect
     from whill_mjx.vehicle.config import VehicleConfig
     from whill_mjx.vehicle.presets import preset_params
@@ -91,7 +92,8 @@ def test_a_delay_of_the_commands_acts_as_in_the_simulator(first):
 @pytest.mark.long
 def test_many_drives_side_by_side_are_those_of_a_few_and_so_are_their_derivatives():
     """Few are computed by one function, which XLA cannot compile for many."""
-    from sysid.replay.rollout import IN_ONE, vehicle_plant
+    from sysid.replay.one_drive import IN_ONE
+    from sysid.replay.rollout import vehicle_plant
     from whill_mjx.vehicle.config import VehicleConfig
     from whill_mjx.vehicle.parameters import get_values, set_values
     from whill_mjx.vehicle.presets import preset_params
@@ -174,8 +176,8 @@ def path_under_way(effect, command, start):
     import jax.numpy as jnp
 
     from sysid.replay.models import with_surroundings
+    from sysid.replay.one_drive import WARM_UP, Commanded, path_of
     from sysid.replay.records import Plant
-    from sysid.replay.rollout import WARM_UP, Commanded, path_of
     from whill_mjx.effects import make_effect
     from whill_mjx.vehicle.types import VehicleParams
 

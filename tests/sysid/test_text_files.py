@@ -12,11 +12,11 @@ import pytest
 
 import sysid
 from bridge.whill import ChairState, WheelOdometry
+from sysid.logs.bags.wheel_states import chair_odometry, chair_row, joint_row, joint_twist
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log
 from sysid.logs.records import Command, with_timeout
-from sysid.logs.text_files import read_table
-from sysid.logs.wheel_states import chair_odometry, chair_row, joint_row, joint_twist
+from sysid.logs.tables.text_table import read_table
 from sysid.replay.wheel_model import wheel_model
 from whill_mjx.io.fields import DATASET
 

@@ -11,11 +11,12 @@ import pytest
 from whill_mjx.env import RICH, make_env, observe, repainted, reset_state
 from whill_mjx.tasks.tasks import make_task, sample_world
 from whill_mjx.world.eye import develop, plain_eye
+from whill_mjx.world.paint import paint
 from whill_mjx.world.render import camera_rotation, pinhole, render
 from whill_mjx.world.render.pallas import Tiling, fast_whole, render_pallas
 from whill_mjx.world.render.rich import NUMBERS, Surface, _paint
 from whill_mjx.world.render.textures import whole
-from whill_mjx.world.rich import PASSAGE, furnish, paint, roles_of
+from whill_mjx.world.rich import PASSAGE, furnish, roles_of
 
 SIZE = 16
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Card
 from whill_mjx.io.registry import Registry
-from whill_mjx.vehicle.types import parameters_of
+from whill_mjx.vehicle.types import Parameter, parameters_of
 
 Kind = TypeVar("Kind", bound=type[Effect])
 
@@ -104,6 +104,12 @@ def make_effects(names: Iterable[str]) -> tuple[Effect, ...]:
 def equation(kind: type[Effect]) -> str:
     """The equation of an effect in one line: the first paragraph of its docstring, without the source."""
     return " ".join((kind.__doc__ or "").split("\n\n")[0].split()).partition(" Source:")[0]
+
+
+def about_of(parameter: str) -> Parameter:
+    """What is known of a parameter EFFECT.NAME before any data."""
+    effect, _, name = parameter.partition(".")
+    return parameters_of(EFFECTS[effect])[name]
 
 
 def card_of(name: str) -> Card:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.planar import DIFFERENCED, pose_speeds, yaw_of
 from whill_mjx.io.fields import shown
 
 KINDS = ("TFMessage", "tfMessage")
@@ -21,7 +22,6 @@ BASES = ("base_footprint", "base_link", "base", "base_frame", "chassis", "robot"
 """Names of the frame that moves with the vehicle, the first found is taken."""
 FIXED = ("map", "world", "earth", "mocap", "vicon", "optitrack", "qualisys", "global", "utm")
 """Names of frames that stand still outside of the vehicle."""
-DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 STANDING = 1e-6  # m, and of a quaternion, that a link may change by and not count as moving
 LISTED = 12  # links that an error names
 HELD = (1.0, 5.0)  # s and usual intervals of a link: the longest time after its end for which it is held without a note
@@ -186,8 +186,8 @@ def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
             moved = -_rotated(turned, moved)
         place, turn = place + _rotated(turn, moved), _product(turn, turned)
     x, y, z, w = turn.T
-    yaw = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-    return Chained(links.topics[0], parent, child, clock[kept, 0], clock[kept, 1], np.column_stack([place[:, :2], yaw]))
+    return Chained(links.topics[0], parent, child, clock[kept, 0], clock[kept, 1], 
+                   np.column_stack([place[:, :2], yaw_of(w, x, y, z)]))
 
 
 def chosen_poses(
@@ -258,14 +258,6 @@ def _only_pose(trees: Sequence[Links], wanted: Sequence[str], notes: list[str]) 
             notes.append(f"no outside pose is taken. {shown(base)} in {shown(outside)} may be one: --truth-topic "
                          f"{links.topics[0]}:{outside}:{base}, if it measures the vehicle from outside")
     return found
-
-
-def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Forward speed and yaw rate (T,) of a pose (T,) whose yaw does not wrap, over `DIFFERENCED` seconds."""
-    half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
-    low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
-    dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
-    return (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
 
 
 def _arrow(link: tuple[str, str]) -> str:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-CHAIR_STATE = "ModelCr2State"
+from sysid.logs.planar import twist_of_wheels
+
 CHAIR_DEFINITION = """int32 battery_power
 float32 battery_current
 float32 right_motor_angle
@@ -47,7 +48,7 @@ def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: flo
     rates = rows[:, 2:]
     if not np.isfinite(rates).all():
         rates = np.gradient(np.unwrap(rows[:, :2], axis=0), t, axis=0)
-    return np.column_stack([wheel_radius * rates.mean(axis=1), wheel_radius * (rates[:, 1] - rates[:, 0]) / track])
+    return np.column_stack(twist_of_wheels(*rates.T, wheel_radius, track))
 
 
 def joint_row(state: Any) -> tuple[float, float, float, float]:
@@ -71,16 +72,6 @@ def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]] | None:
     left = [k for k in wheels if "left" in names[k].lower() or names[k].lower().startswith(("l_", "fl_", "rl_"))]
     right = [k for k in wheels if "right" in names[k].lower() or names[k].lower().startswith(("r_", "fr_", "rr_"))]
     return (left, right) if left and right else None
-
-
-def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dead reckoning of speeds (T,): x, y and yaw that an odometry would report that only logged its wheels."""
-    dt = np.diff(t)
-    turn = (omega[1:] + omega[:-1]) / 2 * dt
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
-    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
-            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)
 
 
 def _odometry(t: np.ndarray, angles: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Recordings of ROS: their streams, found by topic and type."""

@@ -1,0 +1,63 @@
+"""The numbers of one message."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS
+from sysid.logs.bags.wheel_states import chair_row, joint_row
+from sysid.logs.planar import yaw_of
+
+POSE: dict[str, Callable[[Any], Any]] = {
+    "Odometry": lambda message: message.pose.pose, "PoseStamped": lambda message: message.pose,
+    "PoseWithCovarianceStamped": lambda message: message.pose.pose,
+    "TransformStamped": lambda message: message.transform,
+}
+"""Type -> the pose in its message."""
+
+
+def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:
+    """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw; all of them nan where a number is not
+    finite, and infinite where the orientation was never set."""
+    row = _columns(stream, kind, message)
+    whole = all(map(math.isfinite, row)) or all(map(math.isinf, row)) or kind == "JointState"
+    return row if whole else (math.nan,) * len(row)
+
+
+def _columns(stream: str, kind: str, message: Any) -> tuple[float, ...]:
+    if kind == CHAIR_STATE:
+        return chair_row(message)
+    if kind == "Imu":
+        return (float(message.angular_velocity.z),)
+    if kind == "JointState":
+        return joint_row(message)
+    if kind == "Odometry" and stream == "command":
+        return float(message.twist.twist.linear.x), float(message.twist.twist.angular.z)
+    if stream == "command":
+        twist = message.twist if kind == "TwistStamped" else message
+        return float(twist.linear.x), float(twist.angular.z)
+    pose = POSE[kind](message)
+    position = getattr(pose, "position", None) or pose.translation
+    q = getattr(pose, "orientation", None) or pose.rotation
+    if abs(q.w) + abs(q.x) + abs(q.y) + abs(q.z) < 1e-6:
+        return (float("inf"),) * len(COLUMNS[stream])
+    planar = float(position.x), float(position.y), float(yaw_of(q.w, q.x, q.y, q.z))
+    if stream == "ground_truth":
+        return planar
+    speed = message.twist.twist
+    return *planar, float(speed.linear.x), float(speed.angular.z)
+
+
+def header_time(message: Any) -> float:
+    """Header stamp [s]; nan where the message has none."""
+    header = getattr(message, "header", None)
+    return float("nan") if header is None else header.stamp.sec + header.stamp.nanosec * 1e-9
+
+
+def sideways_speed(message: Any) -> float:
+    """Size of the speed to the side that a command asks for [m/s]; 0 where it has none."""
+    twist = getattr(message, "twist", message)
+    size = abs(float(getattr(getattr(twist, "linear", None), "y", 0.0)))
+    return size if math.isfinite(size) else 0.0

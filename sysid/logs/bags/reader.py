@@ -1,0 +1,203 @@
+"""Reads the streams of a driving log out of a ROS bag (rosbag2 .db3 or .mcap, ROS 1 .bag), without ROS.
+
+Known are the paper's topics, the maker's, and those of `bridge.ros`; others are named by the caller or found by their
+type where only one topic has it. Messages: Twist and TwistStamped as commands, Odometry as odometry, Odometry,
+PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and the yaw rate of an Imu. Where there is
+no pose, the transforms between frames (TFMessage) are chained to one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from sysid.logs.bags.frames import frame_streams, unposed
+from sysid.logs.bags.messages import header_time, read_message, sideways_speed
+from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS, OPTIONS, PACKED, SUFFIXES, Bag, BagStream, short_type
+from sysid.logs.bags.topics import choose_topics, framed, no_pose, not_read
+from sysid.logs.bags.wheel_states import CHAIR_DEFINITION, COARSE, JOYSTICK_FIELDS, chair_odometry, joint_twist
+from sysid.logs.planar import integrate_speeds
+from whill_mjx.io.reading import LONGEST_REASON
+
+SIDEWAYS = 0.01  # m/s of a command that is none
+UNPACKED_BYTES = 20_000_000_000  # of one packed bag at most
+DAY, STRAY = 86400.0, 0.01  # s from most messages, and the share of them, up to which a time of receipt is no clock's
+
+
+def read_bag(
+    path: Path, topics: dict[str, str] | None = None, geometry: tuple[float, float] = (0.1325, 0.496),
+    wheels: bool = False,
+) -> Bag:
+    """Streams of a recording.
+
+    Args:
+        path: folder of a rosbag2, or a .db3, .mcap or .bag file.
+        topics: "command", "odometry", "ground_truth", "imu" -> topic; those left out are looked for, "" leaves one out.
+        geometry: nominal wheel radius and track [m], for angles and rates of wheels.
+        wheels: take measured wheel speeds in place of the commands.
+
+    Raises:
+        ValueError: naming the file, the topic, the rule and the remedy.
+    """
+    if path.suffix in PACKED:
+        with TemporaryDirectory() as folder:
+            unpacked = _unpacked(path, Path(folder))
+            try:
+                return replace(read_bag(unpacked, topics, geometry, wheels), path=path)
+            except ValueError as error:
+                raise ValueError(str(error).replace(str(unpacked), str(path))) from None
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise ValueError(f"{path}: reading ROS bags needs the package rosbags ({error}). "
+                         "Run `pip install rosbags`.") from None
+    notes: list[str] = []
+    try:
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        store.register(get_types_from_msg(CHAIR_DEFINITION + JOYSTICK_FIELDS, f"whill_msgs/msg/{CHAIR_STATE}"))
+        with _opened(AnyReader, path, store, notes) as reader:
+            known = {name: str(about.msgtype) for name, about in reader.topics.items() if about.msgcount}
+            asked = topics or {}
+            chosen = choose_topics(path, known, {**asked, **dict.fromkeys(framed(known, asked), "")}, notes, wheels)
+            rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
+            streams = frame_streams(path, reader, known, asked, unposed(chosen, asked, wheels), notes)
+            if not {"odometry", "ground_truth"} & {*chosen, *streams}:
+                raise no_pose(path, known, asked)
+            notes += [] if "ground_truth" in {*chosen, *streams} else not_read(known, "odometry" in chosen)
+    except Exception as error:  # the library lets out whatever a damaged recording leads to
+        if isinstance(error, ValueError) and str(error).startswith(f"{path}: "):
+            raise
+        raise ValueError(f"{path}: cannot be read as a ROS bag ({str(error)[:LONGEST_REASON]}). Give the folder with "
+                         "metadata.yaml, or a .db3, .mcap or .bag file that was closed properly; `ros2 bag reindex` or "
+                         "`mcap recover` repairs one.") from None
+    spare = {"imu"} if asked.get("imu") is None else set()  # found by itself, and nothing depends on it
+    for stream, topic in chosen.items():
+        kept = _usable(path, stream, topic, short_type(known[topic]), rows[stream], notes)
+        if len(kept) >= 2:
+            found = BagStream(topic, known[topic], kept[:, 0], kept[:, 1], kept[:, 2:])
+            streams[stream] = found if kept.shape[1] - 2 == len(COLUMNS[stream]) else _of_wheels(
+                stream, found, geometry, notes)
+        elif stream not in spare:
+            raise _too_few(path, topic, len(kept), stream)
+        elif len(kept):
+            notes.append(f"{topic}: {len(kept)} usable messages; it is left out")
+    return Bag(path, streams, notes)
+
+
+@contextmanager
+def _opened(reader: Any, path: Path, store: Any, notes: list[str]) -> Iterator[Any]:
+    """A reader of a recording; of the files in its folder where metadata.yaml does not go with them, with a note."""
+    files = sorted(one for one in path.iterdir() if one.suffix in SUFFIXES) if path.is_dir() else []
+    opened = reader([path], default_typestore=store)
+    try:
+        opened.open()
+    except Exception as error:  # as of any damaged recording
+        if not files:
+            raise
+        opened = reader(files, default_typestore=store)
+        opened.open()
+        notes.append(f"metadata.yaml does not go with its files ({str(error)[:LONGEST_REASON]}): what is in "
+                     f"{', '.join(one.name for one in files)} is read without it")
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, list[tuple[float, ...]]]:
+    """Time of receipt and of the header [s] and columns of every message, by stream; damaged messages are left out.
+
+    Args:
+        names: topic -> stream.
+    """
+    rows: dict[str, list[tuple[float, ...]]] = {stream: [] for stream in names.values()}
+    broken: Counter[str] = Counter()
+    sideways = 0.0
+    said = ""
+    for connection, received, raw in reader.messages(connections=[one for one in reader.connections
+                                                                  if one.topic in names]):
+        stream = names[connection.topic]
+        try:
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            sideways = max(sideways, sideways_speed(message) if stream == "command" else 0.0)
+            rows[stream].append((received * 1e-9, header_time(message), *read_message(
+                stream, short_type(connection.msgtype), message)))
+        except Exception as error:  # the library lets out whatever a damaged message leads to
+            broken[connection.topic] += 1
+            said = said or str(error)
+    if broken and not any(rows.values()):
+        raise ValueError(said)
+    if sideways > SIDEWAYS:
+        notes.append(f"commands also ask for up to {sideways:.2g} m/s sideways (linear.y): forward speed and yaw rate "
+                     "alone are read, and no model drives sideways. Leave such drives out")
+    notes += [f"{topic}: {count} damaged messages are left out" for topic, count in broken.items()]
+    return rows
+
+
+def _usable(
+    path: Path, stream: str, topic: str, kind: str, rows: list[tuple[float, ...]], notes: list[str]
+) -> np.ndarray:
+    """The rows of a stream as a table, without those that say nothing; notes count these."""
+    if not rows:
+        return np.zeros((0, 2))
+    table = np.array(rows, float)
+    unset = np.isinf(table[:, 2:]).any(axis=1)
+    finite = np.isfinite(table[:, 2:]).all(axis=1) | (kind == "JointState") & ~unset
+    far = np.abs(table[:, 0] - np.median(table[:, 0])) > DAY
+    far &= far.mean() < STRAY
+    if unset.all():
+        if kind == "JointState":
+            raise ValueError(f"{path}: topic {topic}: no joint is called left or right. Name another topic with "
+                             f"{OPTIONS[stream]}.")
+        raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
+                         f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
+    notes += [f"{topic}: {which.sum()} messages {what} are left out" for which, what in (
+        (unset, "with an orientation that is all zero"), (~finite & ~unset, "with numbers that are not finite"),
+        (finite & far, "whose time is more than a day from the others'")) if which.any()]
+    return table[finite & ~far]
+
+
+def _too_few(path: Path, topic: str, count: int, stream: str) -> ValueError:
+    return ValueError(f"{path}: topic {topic} has {count} usable messages; at least 2 are needed. Name another topic "
+                      f"with {OPTIONS[stream]}, or '' to go without.")
+
+
+def _of_wheels(stream: str, found: BagStream, geometry: tuple[float, float], notes: list[str]) -> BagStream:
+    """A stream of wheel angles and rates (T, 4) as motion, in order of time."""
+    later = np.append(True, np.diff(np.maximum.accumulate(found.received)) > 1e-6)
+    received, rows = found.received[later], found.values[later]
+    if (step := float(np.median(np.diff(received)))) > COARSE:
+        notes.append(f"{found.topic}: a state each {step:.2g} s is coarse: delays and lags below that do not show. Ask "
+                     "the driver for 20 ms (publish_interval_ms)")
+    if short_type(found.kind) == CHAIR_STATE:
+        values = chair_odometry(received, rows, *geometry)
+        values = values if stream == "odometry" else values[:, 3:]
+    else:
+        values = joint_twist(received, rows, *geometry)
+        if stream == "odometry":
+            values = np.column_stack([*integrate_speeds(received, *values.T), values])
+    return replace(found, received=received, stamped=found.stamped[later], values=values)
+
+
+def _unpacked(path: Path, folder: Path) -> Path:
+    """A packed bag, as a recorder leaves it that was killed before it wrote metadata.yaml, unpacked into a folder."""
+    from rosbags.rosbag2.reader import zstd  # the standard library's, or what stands for it in older Pythons
+
+    target = folder / path.stem
+    try:
+        with zstd.open(path, "rb") as source, target.open("wb") as out:
+            while part := source.read(1 << 20):
+                if out.tell() > UNPACKED_BYTES:
+                    raise ValueError(f"{path}: is larger than {UNPACKED_BYTES / 1e9:g} GB unpacked. Split it.")
+                out.write(part)
+    except (zstd.ZstdError, EOFError) as error:
+        raise ValueError(f"{path}: cannot be unpacked ({error}). Copy it again, or unpack it with zstd -d.") from None
+    return target

@@ -1,0 +1,103 @@
+"""Trials written into a dataset folder: those that the loader accepts, at once, and never over others."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from sysid.logs.drive_cuts import Drive
+from sysid.logs.log import load_log, load_trial, read_fields, spec_from_fields
+from whill_mjx.io.command_line import WRITING
+from whill_mjx.io.folders import unfinished
+from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, POSE_HEADER, write_csv, write_fields
+from whill_mjx.vehicle.specs import VehicleSpec
+
+HEADERS = {"command": COMMAND_HEADER, "odometry": ODOMETRY_HEADER, "ground_truth": POSE_HEADER, "imu": IMU_HEADER}
+
+
+def write_dataset(
+    folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = (),
+    more: Mapping[str, Any] | None = None, source: Path | None = None,
+) -> list[str]:
+    """Write the trials that the loader accepts into a dataset folder, and note those left out; an existing dataset
+    keeps its fields and trials. `more`: further fields of a new dataset.toml; `source`: named in errors.
+
+    ValueError, and nothing is written, where a trial exists with other contents, names repeat, or none is accepted.
+    """
+    names = [drive.name for drive in drives]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{folder}: two trials would be named {twice[0]!r}. Rename one of the bags.")
+    known = (folder / "dataset.toml").exists()
+    if known and held_out and set(held_out) != set(read_fields(folder / "dataset.toml").get("held_out", ())):
+        raise ValueError(f"{folder / 'dataset.toml'}: exists already, so --held-out cannot be noted. Add the "
+                         "trials to its held_out by hand.")
+    if known and any((folder / "trials").glob("*")):
+        log = load_log(folder)  # trials are not added to what cannot be loaded
+        if log.fields.get("input", "commands") != (more or {}).get("input", "commands"):
+            raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, and that of the new "
+                             "trials is another. Choose another --out.")
+    made, partial = not folder.exists(), unfinished(folder)
+    try:
+        accepted, refused = _write_accepted(partial, drives)
+        notes = [f"left out: {str(error).replace(str(partial), str(folder))}" for error in refused.values()]
+        missing = sorted(set(held_out) & set(refused))
+        if not accepted or missing:
+            reason = notes[0] if not missing else f"{missing[0]} is held out, but it is {notes[0]}"
+            came = f"{source}: made into a trial, " if source else ""
+            raise ValueError(f"{came}{reason.removeprefix('left out: ')} Nothing was written.")
+        if not known:
+            write_fields(partial, spec, held_out, more)
+            spec_from_fields(folder / "dataset.toml", read_fields(partial / "dataset.toml"))
+        for name in refused:
+            shutil.rmtree(partial / "trials" / name)
+        there = [name for name in accepted if (folder / "trials" / name).exists()]
+        for name in there:
+            if _contents(folder / "trials" / name) != _contents(partial / "trials" / name):
+                raise ValueError(f"{folder / 'trials' / name}: exists already, with other contents; a conversion never "
+                                 "replaces a trial. Choose another --out, or remove the trial.")
+        notes += [f"{name} is there already, with the same contents" for name in there]
+        _place(partial, folder, [name for name in accepted if name not in there])
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        with suppress(OSError):
+            if made and not any(folder.iterdir()):
+                folder.rmdir()
+    return notes
+
+
+def _place(partial: Path, folder: Path, trials: Sequence[str]) -> None:
+    """Move what was written to its place, in one step where the dataset is new."""
+    with WRITING:
+        if (partial / "dataset.toml").exists():
+            os.replace(partial / "dataset.toml", folder / "dataset.toml")
+        if not (folder / "trials").exists():
+            os.replace(partial / "trials", folder / "trials")
+        else:
+            for name in trials:
+                os.replace(partial / "trials" / name, folder / "trials" / name)
+
+
+def _contents(trial: Path) -> dict[str, bytes]:
+    """Content of each stream of a trial."""
+    return {stream: path.read_bytes() for stream in HEADERS if (path := trial / f"{stream}.csv").exists()}
+
+
+def _write_accepted(folder: Path, drives: Sequence[Drive]) -> tuple[list[str], dict[str, ValueError]]:
+    """Write trials; returns the names of those that load again, and what is said of the others."""
+    accepted, refused = [], {}
+    for drive in drives:
+        for stream in HEADERS:
+            table = getattr(drive, stream)
+            if table is not None:
+                write_csv(folder / "trials" / drive.name / f"{stream}.csv", HEADERS[stream], table)
+        try:
+            load_trial(folder / "trials" / drive.name)
+            accepted.append(drive.name)
+        except ValueError as error:
+            refused[drive.name] = error
+    return accepted, refused

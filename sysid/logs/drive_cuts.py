@@ -1,0 +1,162 @@
+"""Drives cut out of recordings: whole, or between standstills, each on a clock of its own."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sysid.logs.conversion_options import ConvertConfig
+from sysid.logs.metrics import relative_pose
+from sysid.logs.planar import integrate_speeds
+from sysid.logs.records import PoseStream, Start, Trial
+
+STILL = 1e-3  # m/s, rad/s of commands that a vehicle does not follow
+MOVING = {"v": 0.02, "omega": 0.03}  # m/s, rad/s of the odometry above which the vehicle counts as moving
+LEAD = 2.0  # s of standstill kept before and after a drive
+SHORTEST = 1.0  # s of motion below which a drive is left out
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One trial to be written: tables with t [s] from its own origin in the first column."""
+
+    name: str
+    command: np.ndarray  # (T, 3)
+    odometry: np.ndarray | None  # (T, 6)
+    ground_truth: np.ndarray | None  # (T, 4)
+    imu: np.ndarray | None = None  # (T, 2)
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a recording says of itself: where it is, and its streams by their own names."""
+
+    path: Path
+    streams: dict[str, str]
+
+
+def cut_drives(
+    stem: str, tables: dict[str, np.ndarray], source: Source, config: ConvertConfig
+) -> tuple[list[Drive], list[str]]:
+    """The trials of one recording, whole or cut at standstill, and notes."""
+    if "ground_truth" in tables:
+        tables["ground_truth"] = at_axle(tables["ground_truth"], config)
+    notes = []
+    if config.split == "bag":
+        ends = [(table[0, 0], table[-1, 0]) for name, table in tables.items() if name not in ("command", "imu")]
+        spans = [(max(begin for begin, _ in ends), min(end for _, end in ends))]
+    else:
+        spans = drive_spans(tables, config.pause)
+        notes.append(f"{len(spans)} drives between standstills of {config.pause:g} s")
+    drives = []
+    for number, span in enumerate(spans, start=1):
+        name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
+        drives.append(cut(name, tables, span, source))
+    return drives, notes
+
+
+def cut(
+    name: str, tables: dict[str, np.ndarray], span: tuple[float, float], source: Source
+) -> Drive:
+    """The part of a recording between two times [s] as a trial that counts from its start, with the command then in
+    force.
+
+    Odometry is moved to start at the origin with heading 0.
+    """
+    begin, end = span
+    found: dict[str, np.ndarray] = {}
+    for stream, table in tables.items():
+        inside = table[(table[:, 0] >= begin - 1e-9) & (table[:, 0] <= end + 1e-9)].copy()
+        if stream == "command":
+            before = table[table[:, 0] <= begin + 1e-6]
+            first = before[-1, 1:] if len(before) else np.zeros(2)
+            inside = np.vstack([[begin, *first], inside[inside[:, 0] > begin + 1e-6]])
+        if len(inside) < 2 and stream == "imu":
+            continue
+        if len(inside) < 2:
+            raise ValueError(f"{source.path}: {source.streams[stream]} has {len(inside)} messages in the drive "
+                             f"from {begin - _origin(tables):.1f} to {end - _origin(tables):.1f} s; at least 2 are "
+                             "needed. Use --split bag, or leave the topic out.")
+        inside[:, 0] -= begin
+        found[stream] = inside
+    if "odometry" in found:
+        found["odometry"][:, 3] = np.unwrap(found["odometry"][:, 3])
+        pose = PoseStream(*found["odometry"][:, :4].T)
+        found["odometry"][:, 1:4] = relative_pose(pose, Start(*found["odometry"][0, 1:4]))
+    return Drive(name, found["command"], found.get("odometry"), found.get("ground_truth"), found.get("imu"))
+
+
+def drive_spans(tables: dict[str, np.ndarray], pause: float) -> list[tuple[float, float]]:
+    """Begin and end [s] of each drive: commanded or measured motion, with up to LEAD s of standstill around it."""
+    t, moving = _motion(tables)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], moving, [False]]).astype(int)))
+    runs = [(t[a], t[min(b, len(t) - 1)]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    merged: list[tuple[float, float]] = []
+    for begin, end in runs:
+        if merged and begin - merged[-1][1] < pause:
+            merged[-1] = merged[-1][0], end
+        else:
+            merged.append((begin, end))
+    merged = [(begin, end) for begin, end in merged if end - begin >= SHORTEST]
+    measured = [table for name, table in tables.items() if name not in ("command", "imu")]
+    first, last = max(table[0, 0] for table in measured), min(table[-1, 0] for table in measured)
+    spans = []
+    for k, (begin, end) in enumerate(merged):
+        low = (merged[k - 1][1] + begin) / 2 if k else first
+        high = (end + merged[k + 1][0]) / 2 if k + 1 < len(merged) else last
+        span = max(begin - LEAD, low, first), min(end + LEAD, high, last)
+        if span[1] - span[0] >= SHORTEST:
+            spans.append(span)
+    return spans
+
+
+def _motion(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (G,) [s] every 20 ms, and where the command or the odometry moves (G,) bool."""
+    begin, end = min(table[0, 0] for table in tables.values()), max(table[-1, 0] for table in tables.values())
+    t = np.arange(begin, end, 0.02)
+    command = tables["command"]
+    held = np.searchsorted(command[:, 0], t, side="right") - 1
+    commanded = np.where(held[:, None] >= 0, command[np.maximum(held, 0), 1:], 0.0)
+    moving = (np.abs(commanded[:, 0]) > STILL) | (np.abs(commanded[:, 1]) > STILL)
+    if "odometry" in tables:
+        v, omega = (np.interp(t, tables["odometry"][:, 0], tables["odometry"][:, k]) for k in (4, 5))
+        moving |= (np.abs(v) > MOVING["v"]) | (np.abs(omega) > MOVING["omega"])
+    return t, moving
+
+
+def trial_drive(trial: Trial) -> Drive:
+    """A trial in memory as tables; a window that starts in motion keeps its start pose as its first pose."""
+    odometry = pose = None
+    if trial.odometry is not None:
+        source = trial.odometry
+        x, y, yaw = (source.x, source.y, source.yaw)
+        if x is None or y is None or yaw is None:
+            x, y, yaw = integrate_speeds(source.t, source.v, source.omega)
+        odometry = np.column_stack([source.t, x, y, yaw, source.v, source.omega])
+    if trial.ground_truth is not None:
+        truth = trial.ground_truth
+        pose = np.column_stack([truth.t, truth.x, truth.y, truth.yaw])
+        if pose[0, 0] > 1e-6:
+            pose = np.vstack([[0.0, trial.start.x, trial.start.y, trial.start.yaw], pose])
+        pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
+    imu = None
+    if trial.gyro is not None and len(trial.gyro.t) > 1:
+        imu = np.column_stack([trial.gyro.t, np.gradient(trial.gyro.turn, trial.gyro.t)])
+    return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose, imu)
+
+
+def at_axle(truth: np.ndarray, config: ConvertConfig) -> np.ndarray:
+    """Rows (T, 4) of an outside pose at the drive-axle centre and along the vehicle."""
+    t, x, y, yaw = truth.T
+    yaw = yaw - np.deg2rad(config.truth_turned)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x = x - config.truth_ahead * cos + config.truth_left * sin
+    y = y - config.truth_ahead * sin - config.truth_left * cos
+    return np.column_stack([t, x, y, np.angle(np.exp(1j * yaw))])
+
+
+def _origin(tables: dict[str, np.ndarray]) -> float:
+    return min(float(table[0, 0]) for table in tables.values())

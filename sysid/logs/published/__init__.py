@@ -1,0 +1,1 @@
+"""Published measured sets, in their original form."""

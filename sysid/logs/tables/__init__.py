@@ -1,0 +1,1 @@
+"""Tables of numbers that others wrote, such as CSV and TUM files: their columns, units and streams."""

@@ -1,0 +1,158 @@
+"""What the columns of a drive hold: as the user said, as guessed, and as answered on a terminal."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sysid.logs.tables.columns import ROLES, SAID, Column, Table, is_unit_of, kind_of, unit_of, units_of
+from sysid.logs.tables.guess import guess
+from sysid.logs.tables.names import COUNTS, TICKS, TIME_WORDS, split_unit
+from whill_mjx.io.fields import shown
+
+NAMED = 12  # columns that an error lists
+
+
+def read_decision(text: str, tables: Sequence[Table]) -> Column:
+    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it; a minus before the unit, or in its place, turns the sign.
+
+    ValueError where it is none.
+    """
+    role, equals, rest = text.partition("=")
+    role, rest = role.strip(), rest.strip()
+    if not equals or role not in ROLES:
+        raise ValueError(f"--columns {text}: must be ROLE=COLUMN:UNIT, with a role of {', '.join(ROLES)}.")
+    for table in tables:
+        for name in sorted(table.columns, key=len, reverse=True):
+            for written in (f"{table.stem}/{name}", name):
+                unit = rest[len(written) :].strip()
+                if rest.startswith(written) and (not unit or unit.startswith(":")):
+                    unit = unit_of(unit[1:].strip()) if unit else ""
+                    sign = -1.0 if unit.startswith("-") and role != "time" and kind_of(role) != "none" else 1.0
+                    unit = unit_of(unit[1:]) if sign < 0 else unit
+                    if unit and not is_unit_of(role, unit):
+                        ticks = {"time": ", Nhz for N rows in a second"}.get(
+                            role, ", N/rev for N ticks in a turn" if role.endswith("_angle") else "")
+                        raise ValueError(f"--columns {text}: {unit!r} is no unit of {role} "
+                                         f"(known: {', '.join(units_of(role))}{ticks}).")
+                    return Column(role, table.stem, name, unit or split_unit(name)[1], "" if unit else SAID, sign=sign)
+    known = ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns)
+    raise ValueError(f"--columns {text}: no such column (found {known[:400]}). Correct its name.")
+
+
+def decisions_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:
+    """The decisions that are of these files.
+
+    Raises:
+        ValueError: two of them are of one column, or give one role to two.
+    """
+    found: dict[tuple[str, ...], str] = {}
+    columns = []
+    for text in dict.fromkeys(said):
+        if not _is_here(text, tables) and len(tables) > 1:
+            continue
+        one = read_decision(text, tables)
+        columns.append(one)
+        for key in ((one.role, one.file if one.role == "time" else ""), ("", one.file, one.name)):
+            if (other := found.setdefault(key, text)) != text:
+                raise ValueError(f"--columns {other} and {text}: two decisions on one "
+                                 f"{'role' if key[0] else 'column'}. Leave one of them out.")
+    return columns
+
+
+def decide(
+    source: Path, tables: Sequence[Table], said: Sequence[str], units: Mapping[tuple[str, str], str], wheels: bool
+) -> tuple[list[Column], list[str]]:
+    """What the columns hold: as said, as guessed from names and numbers, and as answered on a terminal."""
+    def guessed_now() -> list[Column]:
+        found = guess(tables, decided, units)
+        return [one for one in found if not wheels or not one.role.startswith("command.")]
+
+    decided = decisions_of(tables, said)
+    columns = guessed_now()
+    problem = _problem(tables, columns)
+    if problem and sys.stdin.isatty() and sys.stdout.isatty():
+        print(f"{source}: {problem}\nGuessed:")
+        for one in columns:
+            print(f"  {one}" + (f"   ({one.why})" if one.why else ""))
+        print("Columns:", ", ".join(f"{table.stem}/{name}" for table in tables for name in table.columns))
+        answer = input("Enter takes this; or type what differs, as ROLE=COLUMN:UNIT ROLE=COLUMN:UNIT ...\n> ")
+        decided = decisions_of(tables, [*said, *answer.split()])
+        columns = [replace(one, why="", sure=True, assumed=False) for one in guessed_now()]
+        problem, said = _problem(tables, columns), [str(one) for one in columns]
+    if problem:
+        names = [f"{table.stem}/{name}" for table in tables for name in (*table.columns, *table.texts)]
+        guessed = " ".join(f"'{one}'" for one in columns) or "nothing"
+        raise ValueError(f"{source}: {problem} Its columns are {first_of(names)}; guessed: {guessed}. Give --columns "
+                         "with what differs and what is missing, each as ROLE=COLUMN:UNIT; see docs/sysid_tools.md.")
+    return columns, list(said)
+
+
+def first_of(names: Sequence[str]) -> str:
+    """A list of columns, as messages show it."""
+    return ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+
+
+def _is_here(text: str, tables: Sequence[Table]) -> bool:
+    """Whether a decision is of one of these files; one without a known column is, so that it is refused."""
+    rest = text.partition("=")[2].strip()
+    if any(rest.startswith((f"{table.stem}/{name}", name)) for table in tables for name in table.columns):
+        return True
+    return all("/" not in rest or rest.split("/")[0] == table.stem for table in tables)
+
+
+def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
+    """What is not clear; empty where a drive can be made."""
+    roles = {one.role for one in columns}
+    used = {one.file for one in columns if one.role != "time"}
+    timeless = sorted(used - {one.file for one in columns if one.role == "time"})
+    if timeless:
+        table = next(table for table in tables if table.stem == timeless[0])
+        said = next((f" Its {name} holds {shown(cell)}, which is no time that is known: write seconds, or "
+                     "YYYY-MM-DD HH:MM:SS.SSS." for name, cell in table.texts.items()
+                     if set(re.split("[^a-z]+", name.lower())) & set(TIME_WORDS)), "")
+        said = said or next((f" If its {name} counts rows, say how many there are in a second: time={table.stem}/{name}"
+                             ":100hz." for name in table.columns if COUNTS.search(name)), "")
+        return f"no column of {timeless[0]} is surely its time.{said}"
+    arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
+    for one in columns:
+        values = arrays[one.file, one.name]
+        if one.role == "time" and one.file in used and np.nanmin(values) == np.nanmax(values):
+            return f"time stands still in {one.file}/{one.name}."
+    commands = _has(roles, "command", "v") or _has(roles, "command", "left", "right")
+    if not commands and (found := [one for one in columns if one.role.startswith("command.")]):
+        return (f"{found[0].file}/{found[0].name} is the only part of a command: v and omega, or left and right belong "
+                "to it.")
+    inputs = _has(roles, "command", "v", "omega") or _has(roles, "command", "left", "right") or _wheels(roles)
+    measured = _has(roles, "ground_truth", "x", "y") or _has(roles, "odometry", "v", "omega") or _has(
+        roles, "odometry", "x", "y")
+    if not inputs and not measured:
+        return "no column is surely a command, a wheel speed or a pose."
+    if {"odometry.v", "odometry.omega"} & roles and not _has(roles, "odometry", "x", "y") and not _has(
+            roles, "odometry", "v", "omega"):
+        return "the odometry has only one of v and omega."
+    if not inputs and not _has(roles, "odometry", "v", "omega"):
+        return "there are neither commands (v, omega) nor wheel speeds."
+    if not commands and not _has(roles, "ground_truth", "x", "y"):
+        return "there are measured speeds, and neither commands nor an outside pose to compare them with."
+    if not measured and not (_wheels(roles) and commands):
+        return "there is neither odometry (v, omega or x, y, yaw) nor an outside pose."
+    if unsure := [one for one in columns if not one.sure]:
+        ticks = next((f" If it counts ticks, say how many make a turn: {one.role}={one.file}/{one.name}:N/rev."
+                      for one in unsure if TICKS.search(one.name)), "")
+        return f"it is not clear what {', '.join(f'{one.file}/{one.name}' for one in unsure)} " + (
+            "is." if len(unsure) == 1 else "are.") + ticks
+    return ""
+
+
+def _has(roles: set[str], stream: str, *quantities: str) -> bool:
+    return all(f"{stream}.{one}" in roles for one in quantities)
+
+
+def _wheels(roles: set[str]) -> bool:
+    return _has(roles, "wheels", "left", "right") or _has(roles, "wheels", "left_angle", "right_angle")

@@ -1,0 +1,195 @@
+"""Units that numbers show: a speed must be the rate of its pose, a measured speed about the commanded one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.logs.planar import yaw_of
+from sysid.logs.tables.columns import UNITS, Column, is_unit_of, kind_of, size_of
+
+FASTEST_STEP = 5e-4  # s; rows that follow faster are in another unit of time
+SERIAL_DAYS, DAY_STEP = ((2e4, 6e4), (7.2e5, 7.6e5)), 5e-5
+"""Ranges of dates that count days, as spreadsheets and MATLAB have them, and the longest step of such a recording."""
+TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
+TOO_SLOW = 0.02  # m/s; a pose that never moves faster shows no unit
+TURNED = 0.3  # rad; the same of a heading
+ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
+GAP = 2.0  # s without samples, over which nothing is interpolated
+
+
+def with_time_unit(column: Column, values: np.ndarray) -> Column:
+    if column.unit in UNITS["time"] and not (column.unit == "s" and np.nanmedian(np.abs(values)) > 1e11):
+        return column
+    known = values[np.isfinite(values)]
+    steps = np.diff(np.unique(known))
+    step = float(np.median(steps)) if len(steps) else 1.0
+    first = float(np.abs(known[0])) if len(known) else 0.0
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):  # since 1970
+        if first > least:
+            return replace(column, unit=unit, why="it counts since 1970")
+    if step < DAY_STEP and any(low < first < high for low, high in SERIAL_DAYS):
+        return replace(column, unit="d", why="it counts days")
+    for unit, longest in (("s", 4.0), ("ms", 4e3), ("us", 4e6)):
+        if step < longest:
+            return replace(column, unit=unit, why=f"it steps by {step:.3g}", sure=column.sure and step > FASTEST_STEP)
+    return replace(column, unit="ns", why=f"it steps by {step:.3g}")
+
+
+def with_units(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
+    """Columns with the units that their numbers agree with, in the order in which one shows the next."""
+    drive = _Known({one.role: one for one in found if one.role != "time"},
+                   {one.file: one for one in found if one.role == "time"}, arrays)  # fmt: skip
+    streams = ("ground_truth", "odometry")
+    for stream in streams:
+        drive.settle_pose(stream)
+    ways = {stream: _way(drive.signal(f"{stream}.x"), drive.signal(f"{stream}.y")) for stream in streams}
+    turns = {stream: _rate(*heading) if (heading := drive.heading(stream)) else None for stream in streams}
+    drive.settle("odometry.v", _first(ways["odometry"], ways["ground_truth"]), "as the pose moves")
+    drive.settle("odometry.omega", _first(turns["odometry"], turns["ground_truth"]), "as the pose turns")
+    for role, rates, why in (("v", ways, "as the vehicle moves"), ("omega", turns, "as the vehicle turns")):
+        measured = _first(drive.signal(f"odometry.{role}"), rates["odometry"], rates["ground_truth"])
+        drive.settle(f"command.{role}", measured, why, 0.5)
+    drive.settle_wheels(_first(drive.signal("command.v"), drive.signal("odometry.v"), *ways.values(),
+                               drive.raw("command.v")))
+    return [one if one.role == "time" else _with_some_unit(drive.columns[one.role], arrays[one.file, one.name])
+            for one in found]
+
+
+def _with_some_unit(one: Column, values: np.ndarray) -> Column:
+    """The column, in SI where nothing shows its unit, if that is at all possible."""
+    wheel = one.role.rpartition(".")[2] in ("left", "right")
+    if is_unit_of(one.role, one.unit):
+        return one
+    usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
+    largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
+    return replace(one, unit=next(iter(UNITS[kind_of(one.role)])), why=f"{one.why}; SI assumed",
+                   sure=one.sure and usual < largest, assumed=True, moves=usual > 0.05)
+
+
+@dataclass
+class _Known:
+    """What is known of the columns of a drive while their units are found."""
+
+    columns: dict[str, Column]  # by role
+    clocks: dict[str, Column]  # by file
+    arrays: Mapping[tuple[str, str], np.ndarray]
+
+    def signal(self, role: str, unit: str = "") -> tuple[np.ndarray, np.ndarray] | None:
+        """Times [s] and values of a role in SI units; None where there are few, or its unit is not known."""
+        one = self.columns.get(role)
+        clock = self.clocks.get(one.file) if one is not None else None
+        if one is None or clock is None or (unit or one.unit) not in UNITS[kind_of(role)]:
+            return None
+        t = self.arrays[clock.file, clock.name] * size_of("time", clock.unit)
+        values = self.arrays[one.file, one.name] * (one.sign * UNITS[kind_of(role)][unit or one.unit])
+        good = np.isfinite(t) & np.isfinite(values)
+        return (t[good], values[good]) if good.sum() > 20 else None
+
+    def raw(self, role: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """The same as if it were in SI units already."""
+        return self.signal(role, next(iter(UNITS[kind_of(role)])))
+
+    def settle(self, role: str, reference: tuple[np.ndarray, np.ndarray] | None, why: str, loose: float = ALIKE
+               ) -> None:  # fmt: skip
+        """Find the unit in which a signal is as large as a reference."""
+        one, mine = self.columns.get(role), self.raw(role)
+        if one is None or one.unit in UNITS[kind_of(role)] or mine is None:
+            return
+        unit = _unit_like(mine, reference, UNITS[kind_of(role)], loose)
+        if unit is not None:
+            self.columns[role] = replace(one, unit=unit, why=f"{one.why}; {why}")
+
+    def settle_wheels(self, reference: tuple[np.ndarray, np.ndarray] | None) -> None:
+        """Find whether wheel speeds are those of their rims: no wheel has a radius of a metre, or of a millimetre."""
+        for stream in ("wheels", "command"):
+            sides = [self.raw(f"{stream}.{side}") for side in ("left", "right")]
+            if sides[0] is None or sides[1] is None or len(sides[0][0]) != len(sides[1][0]):
+                continue
+            mean = sides[0][0], (sides[0][1] + sides[1][1]) / 2
+            unit = _unit_like(mean, reference, {one: UNITS["speed"][one] for one in ("m/s", "mm/s")}, ALIKE)
+            for side in ("left", "right") if unit is not None else ():
+                one = self.columns[f"{stream}.{side}"]
+                if not is_unit_of(one.role, one.unit):
+                    self.columns[one.role] = replace(one, unit=str(unit), why=f"{one.why}; as the vehicle moves")
+
+    def settle_pose(self, stream: str) -> None:
+        """Find the units of a pose: of its heading by the range, of its place by how fast it moves."""
+        role = f"{stream}.yaw"
+        if (one := self.columns.get(role)) and one.unit not in UNITS["angle"] and (mine := self.raw(role)):
+            degrees = bool(np.ptp(mine[1]) > 30)
+            self.columns[role] = replace(one, unit="deg" if degrees else "rad", why=f"{one.why}; its range",
+                                         assumed=not degrees, moves=bool(np.ptp(mine[1]) > TURNED))
+        axes = [self.raw(f"{stream}.{axis}") for axis in ("x", "y")]
+        rate = max((float(np.percentile(np.abs(_rate(*one)[1]), 90)) for one in axes if one is not None), default=0.0)
+        for role in (f"{stream}.x", f"{stream}.y"):
+            if (one := self.columns.get(role)) and one.unit not in UNITS["length"] and self.raw(role):
+                self.columns[role] = replace(one, unit="mm" if rate > TOO_FAST else "m", why=f"{one.why}; its rate",
+                                             assumed=rate <= TOO_FAST, moves=rate >= TOO_SLOW)
+        for role in (f"{stream}.{one}" for one in ("qx", "qy", "qz", "qw")):
+            if one := self.columns.get(role):
+                self.columns[role] = replace(one, unit="-")
+
+    def heading(self, stream: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Times [s] and heading [rad] of a pose, without jumps."""
+        parts = {one: part for one in ("qw", "qx", "qy", "qz") if (part := self.signal(f"{stream}.{one}"))}
+        if {"qw", "qz"} <= set(parts) and len({len(part[0]) for part in parts.values()}) == 1:
+            t, w = parts["qw"]
+            x, y, z = (parts[one][1] if one in parts else np.zeros(len(t)) for one in ("qx", "qy", "qz"))
+            return t, np.unwrap(yaw_of(w, x, y, z))
+        yaw = self.signal(f"{stream}.yaw")
+        return (yaw[0], np.unwrap(yaw[1])) if yaw else None
+
+
+def _first(*signals: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray] | None:
+    return next((one for one in signals if one is not None), None)
+
+
+def _unit_like(
+    mine: tuple[np.ndarray, np.ndarray], reference: tuple[np.ndarray, np.ndarray] | None, units: Mapping[str, float],
+    loose: float,
+) -> str | None:
+    """The unit in which a signal is as large as a reference; None where they are not alike or no unit fits."""
+    if reference is None:
+        return None
+    t = _grid(mine[0], max(mine[0][0], reference[0][0]), min(mine[0][-1], reference[0][-1]))
+    if len(t) < 40:
+        return None
+    ours, theirs = (np.abs(np.interp(t, *one)) for one in (mine, reference))
+    if max(ours.max(), theirs.max()) < 1e-6 or ours.max() < 1e-9 or theirs.max() < 1e-3:
+        return None
+    ratio = float(np.percentile(theirs, 90) / max(np.percentile(ours, 90), 1e-12))
+    apart: dict[str, float] = {}  # ft/s, for example, is too near to km/h for numbers to separate them
+    for one, size in units.items():
+        if all(abs(np.log(size / other)) > np.log(1 + ALIKE) for other in apart.values()):
+            apart[one] = size
+    if ratio <= 0:
+        return None
+    unit = min(apart, key=lambda one: abs(np.log(ratio / apart[one])))
+    return unit if abs(np.log(ratio / apart[unit])) < np.log(1 + loose) + 0.05 else None
+
+
+def _rate(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rate of a signal (T,) over 0.2 s, at 20 Hz."""
+    grid = _grid(t, t[0] + 0.1, t[-1] - 0.1)
+    if len(grid) < 2:
+        return t[:1], np.zeros(1)
+    return grid, (np.interp(grid + 0.1, t, values) - np.interp(grid - 0.1, t, values)) / 0.2
+
+
+def _grid(t: np.ndarray, begin: float, end: float) -> np.ndarray:
+    """Times at 20 Hz from `begin` to `end`, but for gaps of more than GAP in the samples' times (T,)."""
+    inside = np.unique(np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])) if end > begin else np.zeros(0)
+    pieces = [np.arange(one[0], one[-1], 0.05) for one in np.split(inside, np.flatnonzero(np.diff(inside) > GAP) + 1)
+              if len(one)]  # fmt: skip
+    return np.concatenate([*pieces, np.zeros(0)])
+
+
+def _way(x: tuple[np.ndarray, np.ndarray] | None, y: tuple[np.ndarray, np.ndarray] | None
+         ) -> tuple[np.ndarray, np.ndarray] | None:
+    if x is None or y is None or len(x[0]) != len(y[0]):
+        return None
+    (t, vx), (_, vy) = _rate(*x), _rate(*y)
+    return t, np.hypot(vx, vy)
