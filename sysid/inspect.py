@@ -28,6 +28,7 @@ from sysid.logs.measured import load_whole
 from sysid.logs.next_drives import NextDrive, next_drives
 from sysid.logs.records import Log
 from whill_mjx.io.command_line import POSITIVE, Range
+from whill_mjx.io.fields import in_shell
 from whill_mjx.io.folders import check_file, claim_folder, note_written, whole_file
 from whill_mjx.io.formats import stamp
 
@@ -144,7 +145,7 @@ def look(config: InspectConfig, log: Log) -> tuple[dict[str, Any], list[NextDriv
         {"file": OUTPUTS[3 + k], "manoeuvre": one.name, "why": one.why, "seconds": float(one.command.t[-1]),
          "v": float(np.abs(one.command.v).max()), "omega": float(np.abs(one.command.omega).max()),
          "floor": list(one.floor), "radius": one.radius, "drive_it": f"python -m bridge.manoeuvre "
-         f"{(config.out or Path()) / OUTPUTS[3 + k]} --space {config.space[0]:g} {config.space[1]:g} "
+         f"{in_shell((config.out or Path()) / OUTPUTS[3 + k])} --space {config.space[0]:g} {config.space[1]:g} "
          f"--radius {one.radius:g} --check"} for k, one in enumerate(drives)]
     print(json.dumps(plain(found), indent=1) if config.json else text(found))
     return found, drives

@@ -1,6 +1,6 @@
 """Drive manoeuvres with a simulated vehicle and write them as a driving-log dataset.
 
-    python -m whill_mjx.drive --manoeuvre figure_eight --vehicle whill_cr_physical \
+    python -m whill_mjx.drive --manoeuvre figure_eight --vehicle whill_cr_physical
         --effects command_delay:delay=0.2 yaw_scrub:torque=6 --replicates 3 --noise --out DATASET
 
 An effect is NAME, or NAME:PARAMETER=VALUE,...: a vehicle that has the effect gets the values given; any other gets the
@@ -13,21 +13,24 @@ the planted truth.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 from whill_mjx.io.command_line import SEED, OptionError, Range, With, check_once, listen, refusing, run, starts
+from whill_mjx.io.heartbeat import Heartbeat, say_loading
 
 if starts(__name__):
     listen()
+    say_loading()
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.effects import EFFECTS, make_effect
+from whill_mjx.io.fields import counted, in_shell
 from whill_mjx.io.folders import check_place, new_folder
 from whill_mjx.logs.dataset import (
     COMMAND_HEADER,
@@ -59,9 +62,9 @@ class DriveOptions:
     out: Path
     """Dataset folder to write; it must not exist."""
     manoeuvre: tuple[str, ...] = ("figure_eight",)
-    """Manoeuvres to drive, or `all`."""
+    """Of straight, turn, circle, s_curve, figure_eight, reversal, slow_sine, random_steps and standstill; or `all`."""
     vehicle: str = "whill_cr_physical"
-    """Built-in vehicle, or a vehicle file."""
+    """Built-in vehicle (docs/howto/vehicle.md lists them), or a vehicle file."""
     effects: tuple[str, ...] = ()
     """Effects to add to the vehicle, or to change: NAME or NAME:PARAMETER=VALUE,..."""
     replicates: Annotated[int, Range(1, 10_000)] = 1
@@ -80,8 +83,11 @@ class DriveOptions:
     """How hard the manoeuvres are driven."""
 
 
-def main(options: DriveOptions) -> Path:
+def main(options: DriveOptions, stage: Callable[[str], None] = lambda text: None) -> Path:
     """Drive and write the dataset; returns its folder.
+
+    Args:
+        stage: gets a line when the driving begins.
 
     Raises:
         ValueError, FileNotFoundError: naming the option, its value, the rule and the remedy.
@@ -92,6 +98,7 @@ def main(options: DriveOptions) -> Path:
         _check(options, names)
         spec, params, _ = load_vehicle(options.vehicle)
         params = with_effects(params, options.effects)
+    stage("compiling the vehicle, and driving")
     random = np.random.default_rng(options.seed)
     trials = [
         (f"{name}_{replicate}", command, (*random.uniform(-1.0, 1.0, 2), random.uniform(-np.pi, np.pi)))
@@ -260,9 +267,10 @@ def _check(options: DriveOptions, names: tuple[str, ...]) -> None:
 
 def drive_and_say(options: DriveOptions) -> None:
     """Drive, and say what to do with the dataset."""
-    folder = main(options)
+    with Heartbeat() as heartbeat:
+        folder = main(options, heartbeat.stage)
     count = len(list((folder / "trials").iterdir()))
-    print(f"{folder}: {count} trials; fit it with python -m sysid.fit {folder} --out RUN")
+    print(f"{folder}: {counted(count, 'trial')}; fit it with python -m sysid.fit {in_shell(folder)} --out RUN")
 
 
 def cli() -> None:

@@ -26,6 +26,7 @@ import jax
 from dreamer import checkpoint, parallel
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.env import make_env
+from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import RUN_FILE, Claim, FolderRefused, claim_folder, write_whole
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
 from whill_mjx.learning.index_page import list_results, write_index
@@ -141,10 +142,10 @@ def finish(
     write_index(options.out, evaluation, options.task)
     share, interval = evaluation["policy"]["success"], evaluation["policy"]["success_interval_95"]
     baselines = [name for name in ("planner", "random") if name in evaluation]
-    others = ", ".join(f"{name} {evaluation[name]['success']:.0%}" for name in baselines)
+    others = ", ".join(f"{name} {percent(evaluation[name]['success'])}" for name in baselines)
     say(
-        f"success {share:.0%} (95% interval {interval[0]:.0%} to {interval[1]:.0%}), {others}; policy file {policy}; "
-        f"{seconds / 60:.1f} min"
+        f"success {percent(share)} (95% interval {percent(interval[0])} to {percent(interval[1])}), {others}; "
+        f"policy file {policy}; {seconds / 60:.1f} min"
     )
     for line in list_results(options.out):
         say(line)

@@ -136,15 +136,18 @@ def text(found: dict[str, Any]) -> str:
 
 def _trial_lines(trials: list[dict[str, Any]]) -> list[str]:
     """One line per trial, or per group where there are many."""
-    lines = ["Excitation         v [m/s]       omega [rad/s]   rev. turns  slow  acc.  path  turn  still before, after",
-             "                                                             s  m/s2     m   rad  s"]
-    if len(trials) <= MAX_ROWS:
-        return lines + [_excitation_line(t["trial"] + ("*" if t["held_out"] else ""), [t]) for t in trials] + (
-            ["  * held out"] if any(t["held_out"] for t in trials) else [])
     groups: dict[str, list[dict[str, Any]]] = {}
     for trial in trials:
-        groups.setdefault(trial["trial"].split("/")[0], []).append(trial)
-    return lines + [_excitation_line(f"{name} ({len(members)})", members) for name, members in groups.items()]
+        name = trial["trial"] + "*" * bool(trial["held_out"])
+        groups.setdefault(name if len(trials) <= MAX_ROWS else trial["trial"].split("/")[0], []).append(trial)
+    if len(trials) > MAX_ROWS:
+        groups = {f"{name} ({len(members)})": members for name, members in groups.items()}
+    width = max([18, *map(len, groups)])
+    return [f"{'Excitation':{width + 1}}v [m/s]       omega [rad/s]   rev. turns  slow  acc.  path  turn  "
+            "still before, after",
+            " " * (width + 43) + "s  m/s2     m   rad  s",
+            *(_excitation_line(f"{name:{width}}", members) for name, members in groups.items()),
+            *(["  * held out"] if len(trials) <= MAX_ROWS and any(t["held_out"] for t in trials) else [])]
 
 
 def _excitation_line(name: str, trials: list[dict[str, Any]]) -> str:
@@ -157,7 +160,7 @@ def _excitation_line(name: str, trials: list[dict[str, Any]]) -> str:
     omega = min(one["omega"][0] for one in all_of), max(one["omega"][1] for one in all_of)
     still = [float(np.median([one["standstill"][k] for one in all_of])) for k in (0, 1)]
     peaks = [one["acceleration"] for one in all_of if np.isfinite(one["acceleration"])]
-    return (f"  {name:18} {v[0]:+.2f} .. {v[1]:+.2f}  {omega[0]:+.2f} .. {omega[1]:+.2f}  {total('reversals'):5.0f} "
+    return (f"  {name} {v[0]:+.2f} .. {v[1]:+.2f}  {omega[0]:+.2f} .. {omega[1]:+.2f}  {total('reversals'):5.0f} "
             f"{total('turn_changes'):5.0f} {total('slow_seconds'):5.1f} {max(peaks, default=float('nan')):5.2f} "
             f"{total('distance'):5.0f} {total('turn'):5.0f}  {still[0]:.1f} / {still[1]:.1f}")
 

@@ -64,8 +64,9 @@ def next_drives(
     causes = {one.cause for one in blind}
     wanted = {name: cause for cause, name in reversed(CURES.items()) if cause in causes}
     order = [(name, wanted[name]) for name in dict.fromkeys(CURES.values()) if name in wanted]
-    driven = {trial.manoeuvre for trial in log.trials}
-    order += [(name, "a manoeuvre that the log does not have") for name in OTHERS if name not in driven]
+    named = " ".join(trial.manoeuvre.lower() for trial in log.trials)  # a name may say more, as monday_circle
+    driven = [name for name in OTHERS if name in named]
+    order += [(name, "no drive of the log has this name") for name in OTHERS if name not in driven]
     order += [(name, "one more repeat") for name in OTHERS if name in driven]
     found: list[NextDrive] = []
     for name, why in order:

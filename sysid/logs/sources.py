@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from sysid.logs.bags.recording import SUFFIXES, find_bags, is_bag
+from whill_mjx.io.fields import in_shell
 from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 LEROBOT_INFO = "meta/info.json"
@@ -39,13 +40,14 @@ def refuse_recording(path: str | Path, needed: str) -> None:
 
 
 def _about_folder(path: Path) -> str:
-    convert = f"Convert it first: python -m sysid.convert {path} --out DATASET"
+    convert = f"Convert it first: python -m sysid.convert {in_shell(path)} --out DATASET"
     if is_bag(path):
         return f"a ROS bag. {convert}"
     if is_lerobot(path):
         return f"a LeRobotDataset. {convert}"
     if (path / "dataset.toml").exists() or (path / "trials").is_dir():
-        return f"a dataset. Look at it with python -m sysid.inspect {path}, fit it with python -m sysid.fit {path}"
+        return (f"a dataset. Look at it with python -m sysid.inspect {in_shell(path)}, fit it with python -m sysid.fit "
+                f"{in_shell(path)}")
     trial = path.parent.name == "trials" or (path / TRIAL_FILES[0]).exists()
     if trial and any((path / name).exists() for name in TRIAL_FILES):
         return f"one trial, not a dataset. Give the folder that holds dataset.toml and trials/{path.name}."
@@ -56,7 +58,8 @@ def _about_folder(path: Path) -> str:
         return f"{kind} ({bags[0].name}). {convert}"
     entries = sorted(path.iterdir())
     if below := next((one for one in entries if one.is_dir() and find_bags(one)), None):
-        return f"has ROS bags further down ({below.name}). Convert them: python -m sysid.convert {below} --out DATASET"
+        return (f"has ROS bags further down ({below.name}). Convert them: python -m sysid.convert {in_shell(below)} "
+                "--out DATASET")
     if below := next((one for one in entries if (one / "dataset.toml").exists()), None):
         return f"holds datasets ({below.name}). Give one of them: {below}"
     files = [one for one in entries if one.is_file() and not one.name.startswith(".")]
@@ -71,7 +74,7 @@ def _about_folder(path: Path) -> str:
 
 def _about_file(path: Path) -> str:
     if is_bag(path):
-        return f"a ROS bag. Convert it first: python -m sysid.convert {path} --out DATASET"
+        return f"a ROS bag. Convert it first: python -m sysid.convert {in_shell(path)} --out DATASET"
     if path.suffix in PACKED:
         return f"a packed file. Unpack it{' (zstd -d)' if path.suffix in PACKED[:2] else ''}, then give what was in it."
     if path.name == "dataset.toml":
@@ -83,13 +86,13 @@ def _about_file(path: Path) -> str:
     rows = _first_rows(path)
     if rows and all(len(row) == TUM and _numbers(row) for row in rows):
         return ("a trajectory in TUM form (time, position, quaternion). Put it into one folder with a CSV of the "
-                f"commands or wheel speeds, then: python -m sysid.convert {path.parent} --out DATASET")
+                f"commands or wheel speeds, then: python -m sysid.convert {in_shell(path.parent)} --out DATASET")
     if path.suffix in (".csv", ".txt", ".tsv"):
         names = f" with the columns {', '.join(rows[0][:12])}" if rows and not _numbers(rows[0]) else ""
-        return f"a text file{names}. Convert it first: python -m sysid.convert {path} --out DATASET"
+        return f"a text file{names}. Convert it first: python -m sysid.convert {in_shell(path)} --out DATASET"
     if path.suffix in ROBOT_FILES:
-        return (f"a robot file. Look at it with python -m sysid.inspect {path}, fit it to a dataset with python -m "
-                f"sysid.fit DATASET --model {path}")
+        return (f"a robot file. Look at it with python -m sysid.inspect {in_shell(path)}, fit it to a dataset with "
+                f"python -m sysid.fit DATASET --model {in_shell(path)}")
     if path.suffix in (".sdf", ".world"):
         return "a model of Gazebo (SDF). Give the URDF or xacro file of the robot, or an MJCF file."
     return "a file of a kind that is not known. Give a dataset's folder, or a ROS bag to python -m sysid.convert."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -476,3 +477,25 @@ def test_the_bridge_takes_the_next_drives(tmp_path, space):
         reach = reach_of(table, drive.radius, 0.15)
         check_space(reach, space)  # raises where it does not fit
         assert (reach.length, reach.width) == pytest.approx(drive.floor, abs=0.05)
+
+
+def test_a_manoeuvre_counts_as_driven_where_its_name_says_more():
+    log = load_log(CHAIR)
+    renamed = replace(log, trials=tuple(replace(one, manoeuvre=f"Monday_{one.manoeuvre}") for one in log.trials))
+    why = {one.name: one.why for one in next_drives(renamed, ())}
+    assert why == {one.name: one.why for one in next_drives(log, ())}
+    assert "no drive of the log has this name" in why.values() and "circle" not in {
+        name for name, reason in why.items() if reason == "no drive of the log has this name"}
+
+
+def test_the_table_of_drives_stays_in_line_for_long_names_and_hints_can_be_copied(tmp_path, capsys):
+    log = load_log(CHAIR)
+    long = replace(log, trials=tuple(replace(one, name=f"a_long_name_of_a_drive_{one.name}") for one in log.trials))
+    rows = [line for line in text(inspect(long)).splitlines() if line.startswith("  a_long_name") and ".." in line]
+    table = [row for row in rows if " / " in row]
+    assert len(table) == len(log.trials) and len({row.index(" .. ") for row in table}) == 1
+    out = tmp_path / "my runs"
+    main(InspectConfig(CHAIR, out=out))
+    hints = [one["drive_it"] for one in json.loads((out / "inspect.json").read_text())["next_drives"]]
+    assert hints and all(Path(shlex.split(hint)[3]).is_file() for hint in hints)
+    assert hints[0] in capsys.readouterr().out

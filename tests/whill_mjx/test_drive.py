@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 
 import numpy as np
 import pytest
 
 from whill_mjx.drive import DriveOptions, main, parse_effect, with_effects
+from whill_mjx.io import command_line
 from whill_mjx.logs.manoeuvres import MANOEUVRES, Scenario, command_table
 from whill_mjx.logs.simulated_sensors import Sensors
 from whill_mjx.vehicle.vehicle_file import load_vehicle
@@ -36,6 +38,26 @@ def test_every_manoeuvre_starts_and_ends_at_rest_within_its_limits(name):
     assert not v[rest].any() and not omega[rest].any() and v[-1] == omega[-1] == 0.0
     assert np.abs(v).max() <= 0.5 and np.abs(omega).max() <= 0.6
     assert (name == "standstill") == (not v.any() and not omega.any())
+
+
+@pytest.mark.quick
+def test_help_names_every_manoeuvre(capsys):
+    with pytest.raises(SystemExit) as ended:
+        command_line.run(DriveOptions, main, None, positional=False, args=["--help"])
+    assert not ended.value.code
+    assert set(MANOEUVRES) <= set(re.findall(r"\w+", capsys.readouterr().out))
+
+
+@pytest.mark.quick
+def test_a_drive_says_what_takes_long_after_its_options_are_checked(tmp_path, monkeypatch):
+    said = []
+    with pytest.raises(command_line.OptionError):
+        main(DriveOptions(tmp_path), said.append)  # it exists
+    assert not said
+    monkeypatch.setattr("whill_mjx.drive.record_motion", lambda *given: (_ for _ in ()).throw(KeyError("driving")))
+    with pytest.raises(KeyError, match="driving"):
+        main(DriveOptions(tmp_path / "new"), said.append)
+    assert len(said) == 1
 
 
 @pytest.mark.quick

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 
 import pytest
 
 from whill_mjx.evaluation.pictures import reward_curve
+from whill_mjx.io.fields import percent
 from whill_mjx.io.html import STYLE
 from whill_mjx.learning.index_page import list_results, write_index
 
@@ -34,6 +36,21 @@ def test_the_page_shows_what_is_there_and_every_link_leads_to_a_file(run):
     assert all((out / link).is_file() for link in links)
     assert re.search(r"<video [^>]*failures.mp4", text) and re.search(r"<img [^>]*drives.png", text)
     assert "reward_curve.png" not in text  # it was not drawn
+
+
+def test_a_share_is_not_rounded_to_all_or_none_of_the_episodes(tmp_path):
+    nearly = {**FIGURES, "success": 0.995, "collision": 0.005, "success_interval_95": [0.988, 0.9996], "episodes": 1000}
+    text = write_index(tmp_path, {"env_steps": 400, "policy": nearly}, "obstacle_course").read_text()
+    assert "succeeds in 99.5% of 1000" in text and "98.8% to over 99.9%" in text and "<td>0.5%" in text
+    shown = [percent(share) for share in (0.0, 1e-4, 0.25, 0.9996, 1.0)]
+    assert shown == ["0%", "under 0.1%", "25%", "over 99.9%", "100%"]
+
+
+def test_the_next_command_can_be_copied_where_the_folder_has_a_space(tmp_path):
+    out = tmp_path / "my runs" / "first"
+    (out / "policy").mkdir(parents=True)
+    hint = next(line for line in list_results(out) if line.startswith("next: "))
+    assert shlex.split(hint)[4] == str(out / "policy")
 
 
 def test_the_last_lines_name_the_page_the_reports_and_the_pictures(run):

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import LOCK_FILE, RUN_FILE
 from whill_mjx.io.reading import JSON_BYTES, read_arrays, read_bytes, read_json, read_text
 
@@ -304,12 +305,12 @@ def _sentence(
             return f"It cannot be read as a whole: {problems[0]}"
         if kind == "training" and result:
             policy = result["policy"]
-            return f"The policy succeeds in {policy['success']:.0%} of {policy['episodes']} unseen episodes."
+            return f"The policy succeeds in {percent(policy['success'])} of {policy['episodes']} unseen episodes."
         if kind == "training":
             return _progress(state, about, lines)
         if kind == "evaluation" and result:
             name, first = next(iter(result["drivers"].items()))
-            return f"{name.capitalize()} succeeds in {first['success']:.1%} of {first['episodes']} episodes."
+            return f"{name.capitalize()} succeeds in {percent(first['success'])} of {first['episodes']} episodes."
         if kind == "missing effect" and result:
             return f"{result['verdict'].capitalize()}: {result['reason']}."
         if result:
@@ -329,7 +330,7 @@ def _progress(state: str, about: dict[str, Any], lines: Sequence[dict[str, float
     done = int(lines[-1].get("env_steps", 0))
     text = f"{how} at step {done:,}" + (f" of {int(total):,}" if isinstance(total, int | float) else "")
     shown = [line["eval/success"] for line in lines if "eval/success" in line]
-    return f"{text}; its last evaluation succeeds in {shown[-1]:.0%} of the episodes." if shown else (
+    return f"{text}; its last evaluation succeeds in {percent(shown[-1])} of the episodes." if shown else (
         f"{text}; nothing is evaluated yet.")
 
 

@@ -13,6 +13,7 @@ from whill_mjx.evaluation.episodes import MEANS, OF_SUCCESSES, SHARES, Episodes
 from whill_mjx.evaluation.pictures import _corners, _pyplot, _save
 from whill_mjx.evaluation.sweeps import Sweep
 from whill_mjx.io import html
+from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.video import write_h264
 
@@ -266,7 +267,7 @@ def _caption(path: Path) -> str:
 def _shown(name: str, value: float | None) -> str:
     if value is None:
         return "–"
-    return f"{value:.1%}" if name in SHARES else html.number(float(value))
+    return percent(value) if name in SHARES else html.number(float(value))
 
 
 def _with_interval(name: str, value: float | None, interval: list[float] | None) -> str:

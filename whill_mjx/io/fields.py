@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
+import os
+import shlex
 import types
 import typing
 from collections.abc import Iterable
@@ -161,6 +163,19 @@ def _typed(where: str, hint: Any, value: Any, name: str) -> Any:
 def counted(count: int, what: str) -> str:
     """A number of things in words: "1 row", "3 rows"."""
     return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def percent(share: float) -> str:
+    """A share in percent, as "75%" or "99.5%". "0%" and "100%" mean none and all: nothing is rounded to them."""
+    digits = f"{100 * share:.1f}".removesuffix(".0")
+    if digits == "100" and share < 1.0:
+        return "over 99.9%"
+    return "under 0.1%" if digits == "0" and share > 0.0 else f"{digits}%"
+
+
+def in_shell(path: str | os.PathLike[str]) -> str:
+    """A path as one word of a shell, so that a hint can be copied: names with spaces or brackets are quoted."""
+    return shlex.quote(os.fspath(path))
 
 
 def shown(value: Any) -> str:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 from whill_mjx.io import html
+from whill_mjx.io.fields import in_shell, percent
 from whill_mjx.io.folders import write_whole
 
 INDEX = "index.html"
@@ -47,7 +47,7 @@ def write_index(out: Path, evaluation: dict[str, Any], task: str) -> Path:
     title = f"Training in the task {task.replace('_', ' ')}"
     subtitle = f"This is the policy after {evaluation['env_steps']} environment steps, the best of the evaluations."
     policy = evaluation["policy"]
-    lead = f"The policy succeeds in {policy['success']:.0%} of {policy['episodes']} unseen episodes."
+    lead = f"The policy succeeds in {percent(policy['success'])} of {policy['episodes']} unseen episodes."
     write_whole(out / INDEX, html.html_page(title, sections, subtitle, kind="Training", lead=lead))
     return out / INDEX
 
@@ -63,7 +63,7 @@ def list_results(out: Path) -> list[str]:
     if pictures:
         lines.append(f"pictures and videos in {out}: {', '.join(pictures)}")
     if (out / "policy").is_dir():
-        lines.append(f"next: python -m whill_mjx.evaluate {os.fspath(out / 'policy')} --html")
+        lines.append(f"next: python -m whill_mjx.evaluate {in_shell(out / 'policy')} --html")
     return lines
 
 
@@ -73,10 +73,11 @@ def _result(out: Path, evaluation: dict[str, Any]) -> str:
         one = evaluation[name]
         low, high = one["success_interval_95"]
         seconds = one["time_to_goal_s"]
-        rows.append([DRIVERS[name], f"{one['success']:.0%}", f"{low:.0%} to {high:.0%}", f"{one['collision']:.0%}",
-                     f"{one['timeout']:.0%}", "–" if seconds is None else f"{seconds:.1f} s", one["return"]])
+        rows.append([DRIVERS[name], percent(one["success"]), f"{percent(low)} to {percent(high)}",
+                     percent(one["collision"]), percent(one["timeout"]),
+                     "–" if seconds is None else f"{seconds:.1f} s", one["return"]])
     header = ["driver", "success", "95% interval", "collision", "time-out", "time to the goal", "return"]
-    command = f"python -m whill_mjx.evaluate {out / 'policy'} --html"
+    command = f"python -m whill_mjx.evaluate {in_shell(out / 'policy')} --html"
     return html.table(header, rows) + html.paragraph(f"More episodes, proofs of sight and sweeps: {command}", "dim")
 
 

@@ -171,8 +171,8 @@ def _read(path: Path) -> dict[str, Any]:
     """Content of a vehicle file, of the right kind and schema."""
     if path.suffix in ROBOT_FILES and path.is_file():
         raise ValueError(f"{path}: a robot file; needed here is a vehicle file. Fit it to a driving log: python -m "
-                         f"sysid.fit DATASET --model {path} --out RUN writes RUN/vehicle.toml where a vehicle of the "
-                         "simulator drives alike.")
+                         f"sysid.fit DATASET --model {fields.in_shell(path)} --out RUN writes RUN/vehicle.toml "
+                         "where a vehicle of the simulator drives alike.")
     content = read_toml(path, "no such vehicle file. Make one with `python -m sysid.fit DATASET --out RUN`.",
                         "Vehicle files are written by sysid.fit.")
     content = upgraded(KIND, content)
