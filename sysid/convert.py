@@ -23,6 +23,7 @@ if starts(__name__):
 from sysid import command_line
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.records import Log
+from whill_mjx.io.fields import counted, in_shell
 from whill_mjx.io.folders import LOCK_FILE, FolderRefused, check_place, lock_folder
 
 
@@ -36,9 +37,11 @@ def main(config: ConvertConfig) -> Log:
         print("columns as --columns takes them, ROLE=FILE/COLUMN:UNIT, and how role and unit were found:")
     for note in notes:
         print(note)
-    count, seconds = len(log.trials), sum(trial.duration for trial in log.trials)
-    print(f"{config.out}: {count} trial{'s' * (count > 1)}, {seconds:.0f} s; look at it with python -m sysid.inspect "
-          f"{config.out}")
+    print(f"geometry: {log.spec.name}, wheel radius {log.spec.wheel_radius:g} m, track {log.spec.track:g} m; if that "
+          "is not your vehicle, convert again with --wheel-radius and --track")
+    seconds = sum(trial.duration for trial in log.trials)
+    print(f"{config.out}: {counted(len(log.trials), 'trial')}, {seconds:.0f} s; look at it with "
+          f"python -m sysid.inspect {in_shell(config.out)}")
     return log
 
 

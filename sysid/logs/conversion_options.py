@@ -22,7 +22,8 @@ class ConvertConfig:
     fps: Annotated[int | None, Range(1, 1000), With("to", ("lerobot",))] = None
     """Frames per second of a LeRobotDataset that is written; by default the rate of the measurements."""
     vehicle: str = "whill_cr"
-    """Built-in vehicle whose nominal geometry is noted; measured sets know their own."""
+    """Built-in vehicle whose nominal geometry is noted, or any name with --wheel-radius and --track; measured sets know
+    their own."""
     wheel_radius: Annotated[float | None, Range(0.001, 2)] = None
     """Nominal wheel radius [m], where it is not the vehicle's."""
     track: Annotated[float | None, Range(0.01, 5)] = None

@@ -63,6 +63,44 @@ def with_units(c):
             "speed_kmh": 3.6 * c["v"], "yaw rate [deg/sec]": np.rad2deg(c["w"])}
 
 
+def german(c):
+    return {"Zeit [s]": c["t"], "Soll v [km/h]": 3.6 * c["cv"], "Soll Gier [°/s]": np.rad2deg(c["cw"]),
+            "Odo x [m]": c["x"], "Odo y [m]": c["y"], "Odo Gier [°]": np.rad2deg(c["yaw"]),
+            "Ist v [km/h]": 3.6 * c["v"], "Ist Gierrate [°/s]": np.rad2deg(c["w"])}
+
+
+def by_their_units(c):
+    return {"time": c["t"], "cmd v [m/s]": c["cv"], "cmd yaw [deg/s]": np.rad2deg(c["cw"]), "odom x [m]": c["x"],
+            "odom y [m]": c["y"], "odom turn [deg]": np.rad2deg(c["yaw"]), "odom v [m/s]": c["v"],
+            "odom heading [deg/s]": np.rad2deg(c["w"])}
+
+
+@pytest.mark.parametrize("form", [german, by_their_units])
+def test_the_unit_says_whether_a_turn_is_a_heading_or_a_rate(tmp_path, form):
+    convert(ConvertConfig(write(tmp_path / "drive.csv", form(columns())), tmp_path / "data"))
+    trial = load_log(tmp_path / "data").trials[0]
+    check(trial)
+    held = np.searchsorted(trial.command.t, 10.0, side="right") - 1
+    assert trial.command.omega[held] == pytest.approx(DRIVE.command.omega[100], abs=1e-3)
+
+
+def test_a_vehicle_that_turns_without_a_commanded_yaw_rate_is_refused_with_the_unused_columns(tmp_path):
+    table = without_units(columns())
+    renamed = {("steer demand" if name == "cmd_w" else name): values for name, values in table.items()}
+    path = write(tmp_path / "drive.csv", renamed)
+    with pytest.raises(ValueError, match="no column is the commanded yaw rate.*not used: drive/steer demand"):
+        convert(ConvertConfig(path, tmp_path / "data"))
+    convert(ConvertConfig(path, tmp_path / "data", columns=("command.omega=steer demand:rad/s",)))
+    assert np.ptp(load_log(tmp_path / "data").trials[0].command.omega) > 0.5
+
+
+def test_a_straight_drive_needs_no_commanded_yaw_rate(tmp_path):
+    table = without_units(columns(CHAIR["straight_1"]))
+    del table["cmd_w"]
+    convert(ConvertConfig(write(tmp_path / "drive.csv", table), tmp_path / "data"))
+    assert not load_log(tmp_path / "data").trials[0].command.omega.any()
+
+
 def without_units(c):
     return {"timestamp": 1e9 * (T0 + c["t"]), "cmd_v": c["cv"], "cmd_w": c["cw"], "odom_x": c["x"], "odom_y": c["y"],
             "odom_theta": np.rad2deg(c["yaw"]), "odom_v": 3.6 * c["v"], "odom_w": np.rad2deg(c["w"]), "gt_x": c["gx"],

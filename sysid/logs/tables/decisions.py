@@ -13,6 +13,7 @@ import numpy as np
 from sysid.logs.tables.columns import ROLES, SAID, Column, Table, is_unit_of, kind_of, unit_of, units_of
 from sysid.logs.tables.guess import guess
 from sysid.logs.tables.names import COUNTS, TICKS, TIME_WORDS, split_unit
+from sysid.logs.tables.sizes import TURNED
 from whill_mjx.io.fields import shown
 
 NAMED = 12  # columns that an error lists
@@ -128,6 +129,9 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
     if not commands and (found := [one for one in columns if one.role.startswith("command.")]):
         return (f"{found[0].file}/{found[0].name} is the only part of a command: v and omega, or left and right belong "
                 "to it.")
+    if _has(roles, "command", "v") and "command.omega" not in roles and (turn := _turned(columns, arrays)) > TURNED:
+        return (f"no column is the commanded yaw rate, though the vehicle turns by {turn:.2g} rad: "
+                f"{_unused(tables, columns)}. Without one, no turn counts as commanded.")
     inputs = _has(roles, "command", "v", "omega") or _has(roles, "command", "left", "right") or _wheels(roles)
     measured = _has(roles, "ground_truth", "x", "y") or _has(roles, "odometry", "v", "omega") or _has(
         roles, "odometry", "x", "y")
@@ -148,6 +152,24 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         return f"it is not clear what {', '.join(f'{one.file}/{one.name}' for one in unsure)} " + (
             "is." if len(unsure) == 1 else "are.") + ticks
     return ""
+
+
+def _turned(columns: Sequence[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> float:
+    """How far the vehicle surely turns [rad]: the least span of its measured headings; 0 where none is measured."""
+    spans = []
+    for one in columns:
+        if one.role in ("odometry.yaw", "ground_truth.yaw"):  # others may have no unit yet
+            values = arrays[one.file, one.name]
+            known = one.in_si(values[np.isfinite(values)])
+            spans.append(float(np.ptp(np.unwrap(known))) if len(known) else 0.0)
+    return min(spans, default=0.0)
+
+
+def _unused(tables: Sequence[Table], columns: Sequence[Column]) -> str:
+    """The columns without a role, as a clause."""
+    used = {(one.file, one.name) for one in columns}
+    names = [f"{table.stem}/{name}" for table in tables for name in table.columns if (table.stem, name) not in used]
+    return f"not used: {', '.join(names[:NAMED])}" if names else "all columns are used"
 
 
 def _has(roles: set[str], stream: str, *quantities: str) -> bool:

@@ -23,7 +23,7 @@ STREAM_WORDS = {
 }
 STREAM_LAST = {word for words in STREAM_WORDS.values() for word in words}
 QUANTITY_WORDS = {
-    "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi", "kurs", "gierwinkel", "rz"),
+    "yaw": ("yaw", "theta", "heading", "psi", "azimuth", "th", "phi", "kurs", "gier", "gierwinkel", "rz"),
     "qx": ("qx",), "qy": ("qy",), "qz": ("qz",), "qw": ("qw",),
     "omega": ("omega", "yawrate", "w", "wz", "angular", "ang", "turnrate", "rot", "gyro", "gyroz", "angularvel",
               "angvel", "turn", "drehrate", "gierrate"),
@@ -31,6 +31,8 @@ QUANTITY_WORDS = {
           "geschwindigkeit", "geschw"),
     "x": ("x", "px", "posx", "tx", "easting", "east"), "y": ("y", "py", "posy", "ty", "northing", "north"),
 }
+OF_TURNS = {"yaw": "angle", "omega": "rate"}
+"""What a turn may be called by either name, and the kind of unit that says which it is."""
 TICKS = re.compile(r"tick|count|enc(oder)?s?([ _]|$)", re.IGNORECASE)
 """In the names of wheel angles that an encoder counts."""
 COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)  # in the names of columns that count rows
@@ -65,6 +67,8 @@ def by_name(table: Table, name: str) -> Column | None:
     quantity = _quantity([word for word in words if word not in stream_words] or words)
     if quantity is None:
         return None
+    if quantity in OF_TURNS:  # a yaw in deg/s is a yaw rate, a turn in deg is a heading
+        quantity = next((one for one, kind in OF_TURNS.items() if unit in UNITS[kind]), quantity)
     stream, sure = _stream_named(words, words_of(table.stem), quantity, table)
     if stream is None or quantity not in QUANTITIES[stream]:
         return None
