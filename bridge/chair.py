@@ -55,7 +55,8 @@ class ChairNode:
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
     parser = Parser(prog="bridge.chair", description="Publish the odometry of a WHILL Model CR2.")
-    parser.add_argument("--state-topic", type=topic_name, default=ros.CHAIR_STATE_TOPIC)
+    parser.add_argument("--state-topic", type=topic_name, default=ros.CHAIR_STATE_TOPIC,
+                        help="whill_msgs/ModelCr2State of the chair's driver")
     parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=WHEEL_RADIUS, help="[m], loaded")
     parser.add_argument("--tread", type=in_range(0.01, 5), default=TREAD, help="[m], between the drive wheels")
     return parser.parse_args(arguments)

@@ -105,8 +105,10 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--full", type=in_range(0.05, 5), nargs=3, required=True,
                         metavar=("FORWARD", "BACKWARD", "TURN"),
                         help="speeds at full deflection, as measured [m/s, m/s, rad/s]")
-    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
-    parser.add_argument("--joy-topic", type=topic_name, default=JOY_TOPIC)
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC,
+                        help="topic of the commands that drive the vehicle")
+    parser.add_argument("--joy-topic", type=topic_name, default=JOY_TOPIC,
+                        help="sensor_msgs/Joy that the chair's driver reads")
     return parser.parse_args(arguments)
 
 

@@ -46,7 +46,8 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--slew", type=in_range(0, infinite=True), nargs=2, metavar=("V", "OMEGA"),
                         default=(math.inf, math.inf),
                         help="largest change of commands [m/s2, rad/s2]; a stop is not slowed")
-    parser.add_argument("--image-topic", type=topic_name, default=ros.IMAGE_TOPIC)
+    parser.add_argument("--image-topic", type=topic_name, default=ros.IMAGE_TOPIC,
+                        help="topic of the camera's images")
     parser.add_argument("--compressed", action="store_true",
                         help="the image topic carries sensor_msgs/CompressedImage (JPEG or PNG)")
     parser.add_argument("--crop", type=whole(0, 100_000), nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"),

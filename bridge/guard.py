@@ -232,8 +232,10 @@ class GuardLink:
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     """Return the options of the command line."""
     parser = Parser(prog="bridge.guard", description="Stop the vehicle if the policy node is killed.")
-    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
-    parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto")
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC,
+                        help="topic of the commands that drive the vehicle")
+    parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
+                        help="auto: as the base listens")
     parser.add_argument("--follow", default="", metavar="SESSION", help="guard this node only, and end after it")
     parser.add_argument("--joystick-lock", action="store_true",
                         help="unlock the chair's joystick where the policy node has died: it may have locked it")

@@ -31,8 +31,28 @@ def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int
     return guarded
 
 
+class WithDefaults(argparse.HelpFormatter):
+    """A form of --help that shows each default which the text itself does not name."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text, default = action.help or "", action.default
+        values = default if isinstance(default, tuple | list) else (default,)
+        said = "default" in text or isinstance(default, bool) or default is argparse.SUPPRESS
+        if said or not values or any(value is None or value in ("", math.inf) for value in values):
+            return text
+        return f"{text} (default: {' '.join(str(value).replace('%', '%%') for value in values)})"
+
+
 class Parser(argparse.ArgumentParser):
     """An `argparse.ArgumentParser` whose complaint is one line, without the usage; it takes no empty words."""
+
+    def __init__(self, *, formatter_class: type[argparse.HelpFormatter] = WithDefaults, **more: Any) -> None:
+        """As argparse's, with `prog` as complaints name it: a module such as `bridge.drive`, or what is typed."""
+        super().__init__(formatter_class=formatter_class, **more)
+
+    def _get_formatter(self) -> argparse.HelpFormatter:
+        typed = self.prog if self.prog.startswith("python") else f"python -m {self.prog}"
+        return self.formatter_class(prog=typed)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse an empty word, which as a path would be the folder that the command is called in; a path whose ~ the

@@ -285,7 +285,8 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         "has stood this long")
     parser.add_argument("--seconds", type=in_range(0, 1e7), default=0.0,
                         help="end after this long; 0: at Ctrl-C or SIGTERM")
-    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC,
+                        help="topic of the commands that drive the vehicle")
     add_dataset_options(parser)
     options = parser.parse_args(arguments)
     if (options.trial is None) != options.recover:
@@ -308,13 +309,15 @@ def add_dataset_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--images", action="store_true", help="the same with images and point clouds")
     parser.add_argument("--held-out", nargs="+", default=[], metavar="TRIAL",
                         help="trials that dataset.toml names as never to be fitted")
-    parser.add_argument("--vehicle", default="WHILL Model CR")
-    parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=0.1325, help="[m]")
-    parser.add_argument("--track", type=in_range(0.01, 5), default=0.496, help="[m]")
-    parser.add_argument("--wheelbase", type=in_range(0, 5), default=0.45, help="[m]")
+    parser.add_argument("--vehicle", default="WHILL Model CR", help="name or short description, for dataset.toml")
+    parser.add_argument("--wheel-radius", type=in_range(0.001, 2), default=0.1325, help="nominal radius [m]")
+    parser.add_argument("--track", type=in_range(0.01, 5), default=0.496, help="distance between the driven wheels [m]")
+    parser.add_argument("--wheelbase", type=in_range(0, 5), default=0.45, help="distance between the axles [m]")
     parser.add_argument("--mass", type=in_range(0.01, 1e4), help="[kg], where known")
-    parser.add_argument("--v-limit", type=in_range(0.01, 100), default=1.0, help="[m/s]")
-    parser.add_argument("--omega-limit", type=in_range(0.01, 100), default=1.0, help="[rad/s]")
+    parser.add_argument("--v-limit", type=in_range(0.01, 100), default=1.0,
+                        help="largest speed that the vehicle drives [m/s], for dataset.toml")
+    parser.add_argument("--omega-limit", type=in_range(0.01, 100), default=1.0,
+                        help="its largest yaw rate [rad/s]")
 
 
 def finish(writer: TrialWriter | SplitWriter) -> bool:

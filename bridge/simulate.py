@@ -334,10 +334,12 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
                         help="serve episode control over TCP: resets and lock-step (bridge.episodes); 0: any free port")
     parser.add_argument("--bind", default="127.0.0.1", metavar="ADDRESS",
                         help=f"address of the port; another than the loopback needs a token in {TOKEN_VARIABLE}")
-    parser.add_argument("--command-type", choices=("Twist", "TwistStamped"), default="Twist")
+    parser.add_argument("--command-type", choices=("Twist", "TwistStamped"), default="Twist",
+                        help="message that the simulated vehicle listens to")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
                         help="SCHED_FIFO priority, like 20")
-    parser.add_argument("--simulator", default=SIMULATOR, metavar="MODULE:FACTORY")
+    parser.add_argument("--simulator", default=SIMULATOR, metavar="MODULE:FACTORY",
+                        help="another simulator behind the same topics")
     return parser.parse_args(arguments)
 
 

@@ -277,8 +277,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                              "end, and by the guard where this node dies")
     parser.add_argument("--v-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
                         help="[m/s]; default: those of policy and base")
-    parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"), help="[rad/s]")
-    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC)
+    parser.add_argument("--omega-limits", type=in_range(-100, 100), nargs=2, metavar=("LOW", "HIGH"),
+                        help="[rad/s]; default: those of policy and base")
+    parser.add_argument("--command-topic", type=topic_name, default=ros.COMMAND_TOPIC,
+                        help="topic of the commands that drive the vehicle")
     parser.add_argument("--command-type", choices=("auto", "Twist", "TwistStamped"), default="auto",
                         help="auto: as the base listens")
     parser.add_argument("--guard", choices=("own", "other"), default="own",

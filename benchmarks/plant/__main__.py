@@ -25,16 +25,16 @@ def main(arguments: list[str] | None = None) -> Path:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, help="dataset folder to write; it must not exist")
-    parser.add_argument("--effects", default="{}", help="JSON: size by name")
+    parser.add_argument("--effects", default="{}", help="JSON: size by name, such as '{\"slope\": 0.02}'")
     parser.add_argument("--seed", type=whole(0), default=0, help="of commands, day, disturbances and noise")
     parser.add_argument("--noise", type=in_range(0), default=1.0, help="factor on disturbances and sensor noise")
     parser.add_argument("--nominal", action="store_true", help="the nominal chair instead of one of a day")
     parser.add_argument("--no-ground-truth", action="store_true", help="leave out the outside pose")
     parser.add_argument("--manoeuvres", nargs="+", help="some of the nine")
-    parser.add_argument("--replicates", type=whole(), default=3)
+    parser.add_argument("--replicates", type=whole(), default=3, help="drives of each manoeuvre; default 3")
     parser.add_argument("--answers", type=Path, help="file, outside the dataset, for what was driven")
-    parser.add_argument("--processes", type=whole(), default=1)
-    parser.add_argument("--vehicle", choices=VEHICLES, default="chair")
+    parser.add_argument("--processes", type=whole(), default=1, help="processes that drive at a time; default 1")
+    parser.add_argument("--vehicle", choices=VEHICLES, default="chair", help="what drives; default chair")
     given = parser.parse_args(arguments)
     try:
         effects = {str(name): float(size) for name, size in json.loads(given.effects).items()}
