@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
+from typing import Annotated
 
 import marker_seeker
 import pytest
 
 from whill_mjx import drive, evaluate, export_mjcf, export_python, look, maps, view
 from whill_mjx.io import command_line
+from whill_mjx.io.command_line import Range
 from whill_mjx.logs import paths
 
 pytestmark = pytest.mark.quick
@@ -174,3 +177,23 @@ def test_a_damaged_note_beside_a_policy_is_named(text, said, tmp_path, monkeypat
     code, line = mistaken("evaluate", "run/policy --out new", capsys)
     assert code == command_line.REFUSED and f"run.json: {said}" in line
     assert not (tmp_path / "new").exists()
+
+
+@dataclasses.dataclass(frozen=True)
+class TwoLines:
+    """Options of a test."""
+
+    first: Annotated[int, Range(1, 5)] = 1
+    """A sentence that begins in one line of its docstring
+    and ends in the next."""
+
+
+def test_help_wraps_a_sentence_of_two_lines_as_one(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    for _ in range(2):
+        with pytest.raises(SystemExit):
+            command_line.run(TwoLines, lambda options: None, None, args=["--help"])
+        assert "one line of its docstring and ends in the next." in capsys.readouterr().out
+    with pytest.raises(SystemExit):  # its range still counts
+        command_line.run(TwoLines, lambda options: None, None, args=["--first", "9"])
+    assert "--first 9: must be at least 1 and at most 5" in capsys.readouterr().err

@@ -242,11 +242,26 @@ def program() -> str:
     return f"python -m {spec.name.removesuffix('.__main__')}" if spec else os.path.basename(sys.argv[0])
 
 
+def _join_lines_of_help(options: type) -> None:
+    """Let --help wrap a field's docstring as one text. tyro takes an indented line of it for a new paragraph."""
+    import tyro
+    from docstring_parser import parse_from_object
+
+    texts = {one.arg_name: one.description or "" for one in parse_from_object(options).params}
+    for name, hint in typing.get_type_hints(options, include_extras=True).items():
+        marks = getattr(hint, "__metadata__", ())
+        if dataclasses.is_dataclass(inner := hint.__origin__ if marks else hint):
+            _join_lines_of_help(typing.cast(type, inner))
+        elif "\n" in texts.get(name, ""):
+            options.__annotations__[name] = typing.Annotated[hint, tyro.conf.arg(help=" ".join(texts[name].split()))]
+
+
 def _parsed(options: type, description: str | None, positional: bool, args: list[str] | None) -> Any:
     """The options of the command line; what tyro finds wrong in them becomes one line."""
     import tyro
 
     words = sys.argv[1:] if args is None else args
+    _join_lines_of_help(options)
     check_words(words)
     check_lists(options, words)
     config = (tyro.conf.PositionalRequiredArgs,) if positional else ()
