@@ -332,7 +332,10 @@ def _draw(options: Look) -> None:
         heartbeat.stage(f"drawing {options.scene}: half a minute, most of it compilation")
         sheet = gallery_sheet() if seen is None else contact_sheet(*seen, options.worlds, options.steps, options.seed)
     write_png(options.out, sheet.repeat(options.scale, 0).repeat(options.scale, 1))
-    print(f"{options.out}: {options.scene}")
+    rows = "" if seen is None else (
+        f"; each column is a world. Rows: the camera at the start, the camera after {options.steps} control steps of "
+        "a planner, and the world from above with its path")
+    print(f"{options.out}: {options.scene}{rows}")
 
 
 def cli() -> None:

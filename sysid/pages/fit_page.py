@@ -211,7 +211,9 @@ def parameters(report: dict[str, Any]) -> str:
              paragraph("Bar: interval (blue) and fitted value (dot) within the bounds of the search; the orange tick "
                        "is the initial value.", "dim")]
     if report["weak_combinations"]:
-        parts += [heading("Combinations that this log does not determine"), bullets(report["weak_combinations"])]
+        parts += [heading("Combinations that this log does not determine"), bullets(report["weak_combinations"]),
+                  paragraph("Each line is a direction in which the parameters may move together, by these shares of "
+                            "their ranges, while the replayed drives hardly change.", "dim")]
     if report.get("spectrum"):
         spectrum = table(["combination", "information", "standard error"], [
             [one["combination"], one["information"], max(one["information"], 1e-12) ** -0.5]

@@ -188,7 +188,8 @@ def _found(report: Mapping[str, Any]) -> str:
             known = [p for p in one["parameters"].values() if not _may_be_none(p)] or list(one["parameters"].values())
             law = known[0].get("description") or ""
             texts.append(f"{spoken(one['name'])}" + (f" ({law[0].lower()}{law[1:]})" if law else ""))
-        return f"What explains these drives is {' and '.join(texts)}."
+        text = " and ".join(texts)
+        return f"{text[0].upper()}{text[1:]} explain{'s' if len(texts) == 1 else ''} these drives."
     where = [one["quantity"] for one in report["lives_in"][:2]]
     return ("These drives differ from the vehicle as it was, in a way that no effect of the catalogue has"
             + (f"; the difference depends on {' and on '.join(where)}." if where else "."))

@@ -80,7 +80,7 @@ def test_an_open_end_is_said():
 
 def test_three_sentences_say_what_it_is_what_it_changes_and_what_is_open():
     what, change, rest = lead(report(DELAY))
-    assert what == "What explains these drives is command delay (time from sending a command to its effect)."
+    assert what == "Command delay (time from sending a command to its effect) explains these drives."
     assert "27.0 cm for the vehicle as it was, 15.0 cm refitted within its day-to-day spread, 2.0 cm with" in change
     assert "two repeats of one drive differ by 1.4 cm" in change and "No other effect" in rest
     alike = effect("command_delay", DELAY["parameters"], ("sensor_delay", "clock_offset"))

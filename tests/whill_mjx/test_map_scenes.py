@@ -28,6 +28,7 @@ from whill_mjx.world.maps import (
     load_footprints,
     make_map_scene,
     map_scene_sampler,
+    picture,
     read_map,
     shown,
 )
@@ -284,6 +285,16 @@ def test_the_command_writes_a_picture_and_the_walls(tmp_path):
     for words, message in ((["no.yaml"], "does not exist"), (["town.txt"], "unknown kind of map")):
         done = subprocess.run([*command, *words], cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 2 and message in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(("metre", "length"), [(110.0, 2.0), (4.0, 50.0), (700.0, 0.2)])
+def test_the_legend_of_a_map_has_a_bar_of_its_scale(metre, length):
+    strip = picture._legend(1100, metre)
+    bar = (strip[picture.LEGEND // 2] == picture.WALL).all(-1)[:250]
+    last = int(np.flatnonzero(~bar[12:])[0]) + 11  # where the bar that begins at 10 ends
+    assert strip.shape == (picture.LEGEND, 1100, 3) and last - 10 == pytest.approx(length * metre, abs=3)
+    for colour in (picture.START, picture.GOAL, picture.WAY):
+        assert (strip == colour).all(-1).sum() > 20
 
 
 def test_floor_plans_of_a_seed_are_rooms_that_hang_together():

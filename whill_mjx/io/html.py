@@ -37,6 +37,7 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowra
 caption { text-align: left; color: #6a6a6a; padding-bottom: .2rem; max-width: min(62rem, calc(100vw - 1.7rem)); }
 td.differs { background: #fff3d1; } td.differs:first-child { border-left: .25rem solid #e0a014; }
 details { margin: .6rem 0; } summary { cursor: pointer; color: #1f5f9f; }
+td:last-child:not(.n) { min-width: 10rem; }
 td small { color: #6a6a6a; display: block; }
 td.good { color: #176b32; } td.bad { color: #a31621; font-weight: 600; } td.warn { color: #8a5a00; }
 .charts { display: flex; flex-wrap: wrap; gap: .4rem 1rem; } figure { margin: .4rem 0; }
@@ -51,8 +52,7 @@ svg .grid { stroke: #e4e4e4; stroke-width: 1; } svg .band { fill: #1f6fb4; opaci
 @media (max-width: 640px) { body { font-size: 14px; padding: 0 .8rem 1.5rem; } h1 { font-size: 1.25rem; }
   h2 { font-size: 1.1rem; margin-top: 1.6rem; } .charts { display: block; } .charts svg { width: 100%; }
   nav a { padding: .25rem 0; } th, td { padding: .25rem .4rem; } figure { margin: .4rem 0; }
-  ul { padding-left: 1.2rem; } td:not(.n) { min-width: 4.2rem; } td:first-child:not(.n) { min-width: 7rem; }
-  td:last-child:not(.n) { min-width: 10rem; } }
+  ul { padding-left: 1.2rem; } td:not(.n) { min-width: 4.2rem; } td:first-child:not(.n) { min-width: 7rem; } }
 @media print { @page { margin: 14mm; } body { font-size: 10pt; max-width: none; padding: 0; }
   nav, video { display: none; }
   h2, h3, caption { break-after: avoid; } figure, tr, svg, img { break-inside: avoid; } .scroll { overflow: visible; }

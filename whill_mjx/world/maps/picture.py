@@ -11,12 +11,16 @@ OUTSIDE, SPACE, SOLID = (225, 225, 225), (255, 255, 255), (190, 180, 175)  # blu
 WALL, START, GOAL, WAY = (60, 50, 40), (60, 160, 40), (230, 60, 20), (210, 200, 120)
 EXAMPLES = 12
 """Pairs of start and goal that are drawn."""
+LEGEND = 28
+"""Height of the legend [pixels]."""
+BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0)
+"""Lengths of the bar that shows the scale [m]."""
 
 
 def from_above(made: MapScene, pixels: int = 1200) -> bytes:
     """PNG in the grid's own frame, its y upwards: space white, occupied cells grey, walls dark.
 
-    Some starts are green, their goals blue.
+    Some starts are green, their goals blue. A legend with the scale is below the map.
     """
     import cv2
 
@@ -48,6 +52,25 @@ def from_above(made: MapScene, pixels: int = 1200) -> bytes:
     for points, colour in ((places.start[chosen, :2], START), (places.goal[chosen], GOAL)):
         for point in np.rint(place(points)).astype(int):
             cv2.circle(image, (int(point[0]), int(point[1])), radius, colour, -1, cv2.LINE_AA)
-    ok, data = cv2.imencode(".png", image)
+    ok, data = cv2.imencode(".png", np.vstack([image, _legend(size[0], scale / grid.resolution)]))
     assert ok
     return data.tobytes()
+
+
+def _legend(width: int, metre: float) -> np.ndarray:
+    """Strip (LEGEND, width, 3) below the map: a bar of a round length, and what the colours mean; `metre` in pixels."""
+    import cv2
+
+    strip = np.full((LEGEND, width, 3), 255, np.uint8)
+    length = max((one for one in BARS if one * metre <= width / 5), default=BARS[0])
+    end, middle = 10 + round(length * metre), LEGEND // 2
+    cv2.line(strip, (10, middle), (end, middle), WALL, 3)
+    x = end + 8
+    entries = ((f"{length:g} m", None), ("start", START), ("goal", GOAL), ("a pair; its way leads around walls", WAY))
+    for word, colour in entries:
+        if colour is not None:
+            cv2.circle(strip, (x + 6, middle), 5, colour, -1, cv2.LINE_AA)
+            x += 16
+        cv2.putText(strip, word, (x, middle + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, WALL, 1, cv2.LINE_AA)
+        x += cv2.getTextSize(word, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)[0][0] + 20
+    return strip
