@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from benchmarks.plant.base import Effect
-from benchmarks.plant.chair import COULOMB, Chair, Nominal
+from benchmarks.plant.chair import COULOMB, SLOW, Chair, Nominal
 from benchmarks.plant.commands import nine
 from benchmarks.plant.effects import EFFECTS, in_proportion
 from benchmarks.plant.first_day import SMALL, SmallPlant
@@ -222,6 +223,20 @@ def test_backlash_delays_the_push_and_vanishing_grip_slides():
     braking = (log.t > 3.55) & (log.t < 3.7)
     sliding = log.speed[braking, 0] - Nominal.radius * np.gradient(log.encoder.mean(axis=1), 0.004)[braking]
     assert sliding.max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("contact", "play", "coasts"), [(SLOW, 0.02, True), (SLOW, 0.01, False), (COULOMB, 0.02, False)]
+)
+def test_large_play_costs_the_chair_its_grip_only_where_tyres_grip_again_late(contact, play, coasts):
+    """After a stop from 0.2 m/s the wheels report rest. Where the controller hunts, the chair slides on."""
+    table = np.array([[0.0, 0.0, 0.0], [0.5, 0.2, 0.0], [2.0, 0.0, 0.0], [2.9, 0.0, 0.0]])
+    log = Plant(replace(Chair(), play=play), contact).drive(table, (0.0, 0.0, 0.0), [], QUIET, np.random.default_rng(1))
+    after = (log.t > 2.25) & (log.t < 2.75)
+    reported = Nominal.radius * np.gradient(log.encoder.mean(axis=1), 0.004)[after].mean()
+    assert abs(reported) < 0.02
+    assert (log.speed[after, 0].mean() > 0.08) == coasts
+    assert coasts or abs(log.speed[after, 0].mean()) < 0.01
 
 
 def test_caster_kick_follows_a_reversal():
