@@ -28,8 +28,8 @@ os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS]).st
 MOST_BYTES = 2_000_000_000
 """Memory of a worker beyond which it forgets what it has compiled."""
 
-QUICK_TO_COMPILE = ("dreamer", "whill_mjx")
-"""Folders whose programs take far longer to compile than to run; those of `sysid` replay many long drives."""
+QUICK_TO_COMPILE = ("dreamer", "whill_mjx", "test_among.py", "test_calibration.py")
+"""Folders and files whose programs take far longer to compile than to run; most of `sysid` replay many long drives."""
 
 
 def pytest_collection_finish():
@@ -84,8 +84,8 @@ def programs():
 
 @pytest.fixture(scope="module", autouse=True)
 def few_optimisations(request):
-    """XLA compiles these folders' programs in about half the time."""
-    if request.path.parent.name not in QUICK_TO_COMPILE:
+    """XLA compiles these programs in about half the time."""
+    if not {request.path.parent.name, request.path.name} & set(QUICK_TO_COMPILE):
         yield
         return
     with options(jax_disable_most_optimizations=True):

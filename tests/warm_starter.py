@@ -27,14 +27,16 @@ class Child:
 
     def __init__(self, starter: Warm, pid: int, said: Path):
         self._starter, self.pid, self.said = starter, pid, said
+        self._code: int | None = None  # an ended process can be asked once
 
-    def poll(self) -> int | None:
+    def poll(self, how: str = "poll") -> int | None:
         """Exit code, negative for a signal; None while it works."""
-        return self._starter.ask({"poll": self.pid})
+        self._code = self._starter.ask({how: self.pid}) if self._code is None else self._code
+        return self._code
 
-    def wait(self) -> int:
+    def wait(self) -> int | None:
         """Wait for its end, and return its exit code."""
-        return self._starter.ask({"wait": self.pid})
+        return self.poll("wait")
 
     def send_signal(self, number: int) -> None:
         """Send it a signal; it is not reaped before it is asked for, so the number is its own."""

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import signal
-import subprocess
-import sys
 import time
-import tomllib
+from functools import partial
 from pathlib import Path
 from random import Random
 
@@ -16,6 +13,7 @@ import numpy as np
 import pytest
 from cart import cart
 from conftest import SHORT, TRUTH, unicycle_plant
+from killed import Process, check_whole, killed_again_and_again, left_alone
 from warm_starter import Warm
 
 from benchmarks.planted_logs import Schedule, write_dataset
@@ -87,7 +85,6 @@ COMMANDS = {
     "vehicle": ["sysid.fit", "{chair}", "--quick"],
     "close_loop": ["sysid.close_loop", "{chair}", "--quick", "--refit-nulls", "20"],
 }
-SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
 
 def words_of(which, folder, out):
@@ -95,30 +92,8 @@ def words_of(which, folder, out):
     return [*(word.format(**names) for word in COMMANDS[which]), "--out", str(out)]
 
 
-class Process(subprocess.Popen):
-    """`python -m MODULE WORDS` as users start it."""
-
-    def __init__(self, module, words, said, **options):
-        self.said = said
-        with said.open("w") as file:
-            super().__init__([sys.executable, "-m", module, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=file,
-                             **options)  # fmt: skip
-
-
 def kept_steps(out):
     return len(list((out / "steps").glob("[0-9]*.npz")))
-
-
-def check_whole(out):
-    """Every file with a final name can be read."""
-    for path in (one for one in out.rglob("[!.]*") if one.is_file()):
-        if path.suffix == ".json":
-            json.loads(path.read_text())
-        elif path.suffix == ".toml":
-            tomllib.loads(path.read_text())
-        elif path.suffix == ".npz":
-            with np.load(path) as archive:
-                assert [archive[name] for name in archive.files]
 
 
 def files_of(out):
@@ -137,45 +112,20 @@ def files_of(out):
     return found
 
 
-def killed_again_and_again(start, module, words, out, kills, most, seconds, said):
-    """Start a command and end it at a random moment, `kills` times with each signal; `most` and `seconds` are its steps
-    and its time when it is left alone."""
-    random = Random(4)
-    signals = [number for number in SIGNALS for _ in range(kills)]
-    random.shuffle(signals)
-    for index, number in enumerate(signals):
-        child, wanted = start(module, words, said), (index + 1) * most // (len(signals) + 1)
-        if index % 3 == 0:
-            time.sleep(random.uniform(0.0, seconds / 3))  # some fall into its start
-        while index % 3 and child.poll() is None and kept_steps(out) < wanted:
-            time.sleep(0.005)
-        before = kept_steps(out)
-        if (code := child.poll()) is None:
-            child.send_signal(number)
-            code = child.wait()
-        told = said.read_text()
-        assert code in ((-number, 0) if number == signal.SIGKILL else (130, 0)), told
-        assert "Traceback" not in told and (code == 0 or kept_steps(out) >= before)
-        assert code <= 0 or told.rstrip().endswith(f"({signal.Signals(number).name})"), told
-        check_whole(out)
-
-
-def left_alone(start, module, words, out, said):
-    """Steps and seconds of a command that nobody ends."""
-    began, child, most = time.monotonic(), start(module, words, said), 0
-    while (code := child.poll()) is None:
-        most = max(most, kept_steps(out))
-        time.sleep(0.02)
-    assert code == 0, said.read_text()
-    return most, time.monotonic() - began
+def ended_again_and_again(start, which, folder, outs, kills, said):
+    """Module and words of a command that was left alone in the first folder and ended `kills` times by each signal in
+    the other one."""
+    (module, *straight), (_, *words) = (words_of(which, folder, out) for out in outs)
+    alone, broken = (partial(kept_steps, out) for out in outs)
+    most, seconds = left_alone(start(module, straight, said), said, alone)
+    killed_again_and_again(partial(start, module, words, said), outs[1], kills, broken, most, seconds, said)
+    return module, words
 
 
 def test_a_fit_killed_three_times_by_each_signal_and_then_short_of_disk_ends_in_the_same_bits(folder, tmp_path):
     said, other, outs = tmp_path / "said", tmp_path / "other", [tmp_path / name for name in ("straight", "broken")]
-    (module, *straight), (_, *words) = (words_of("fit", folder, out) for out in outs)
     with Warm("sysid.fit", "sysid.pages.fit_report") as warm:
-        most, seconds = left_alone(warm.start, module, straight, outs[0], said)
-        killed_again_and_again(warm.start, module, words, outs[1], 3, most, seconds, said)
+        module, words = ended_again_and_again(warm.start, "fit", folder, outs, 3, said)
         assert warm.start(module, words, said, largest=20_000).wait() == 1
         told = said.read_text()
         assert f"is in {outs[1] / 'steps'}; the same command goes on there." in told.splitlines()[-1], told
@@ -192,16 +142,15 @@ def test_a_fit_killed_three_times_by_each_signal_and_then_short_of_disk_ends_in_
 @pytest.mark.parametrize("which", COMMANDS)
 def test_a_command_killed_ten_times_by_each_signal_ends_in_the_same_bits(which, folder, tmp_path):
     said, outs = tmp_path / "said", [tmp_path / name for name in ("straight", "broken")]
-    (module, *straight), (_, *broken) = (words_of(which, folder, out) for out in outs)
-    most, seconds = left_alone(Process, module, straight, outs[0], said)
-    killed_again_and_again(Process, module, broken, outs[1], 10, most, seconds, said)
-    assert Process(module, broken, said).wait() == 0 and files_of(outs[1]) == files_of(outs[0])
+    module, words = ended_again_and_again(Process, which, folder, outs, 10, said)
+    assert Process(module, words, said).wait() == 0 and files_of(outs[1]) == files_of(outs[0])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("which", ["fit", "close_loop"])
 def test_two_commands_at_once_in_one_folder_give_one_result_and_one_refusal(which, folder, tmp_path):
     module, *words = words_of(which, folder, tmp_path / "run")
-    children = [Process(module, words, tmp_path / f"said{k}") for k in range(2)]
+    said = [tmp_path / f"said{k}" for k in range(2)]
+    children = [Process(module, words, each) for each in said]
     assert sorted(child.wait() for child in children) == [0, 2]
-    assert sum("writes there" in child.said.read_text() for child in children) == 1
+    assert sum("writes there" in each.read_text() for each in said) == 1

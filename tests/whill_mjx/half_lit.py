@@ -91,5 +91,10 @@ def main(options):
             save_arrays(path, flatten_weights(params))
 
 
-if __name__ == "__main__":
+def cli():
+    """Command line."""
     run(Options, main, __doc__, positional=False)
+
+
+if __name__ == "__main__":
+    cli()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -12,14 +13,14 @@ from random import Random
 import numpy as np
 import pytest
 import tiny_steps
-from test_chaos_training import SIGNALS, finished, started
+from killed import SIGNALS
+from warm_starter import Warm
 
 from whill_mjx.io import steps
 from whill_mjx.io.steps import keep_steps, step, steps_of_rows
 
 pytestmark = pytest.mark.quick
 IDENTITY = {"data": "a", "seed": 0}
-TINY = [sys.executable, str(Path(__file__).with_name("tiny_steps.py"))]
 
 
 class Stop(BaseException):
@@ -168,21 +169,26 @@ def test_a_full_disk_keeps_the_steps_before_and_the_error_says_where(tmp_path):
     assert [path.name for path in (tmp_path / "steps").glob("*")] == ["000000.npz"]
 
 
-def test_a_command_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_path):
-    straight, broken, random = tmp_path / "straight", tmp_path / "broken", Random(7)
-    assert finished(TINY, straight, "--pause", "0")[0] == 0
-    for number in SIGNALS * 3:
-        child = started(TINY, broken)
-        time.sleep(random.uniform(0.0, 0.4))
-        child.send_signal(number)
-        told = child.communicate()[1]
-        if child.returncode == 0:
-            break
-        assert child.returncode == (-number if number == signal.SIGKILL else 130)
-        assert number == signal.SIGKILL or told.strip().splitlines()[-1].startswith("stopped")
-        assert not (broken / "result.npy").exists()
-    assert finished(TINY, broken)[0] == 0
-    np.testing.assert_array_equal(np.load(broken / "result.npy"), np.load(straight / "result.npy"))
-    code, told = finished(TINY, broken, "--seed", "3")
-    assert code == 2 and "seed is 0 there and 3 here" in told
+def test_a_command_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_path, monkeypatch):
+    straight, broken, said, random = *(tmp_path / name for name in ("straight", "broken", "said")), Random(7)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ["PYTHONPATH"]]))
+    with Warm("tiny_steps") as warm:
+        def start(out, *words):
+            return warm.start("tiny_steps", ["--out", str(out), *words], said)
+
+        assert start(straight, "--pause", "0").wait() == 0, said.read_text()
+        for number in SIGNALS * 3:
+            child = start(broken)
+            time.sleep(random.uniform(0.0, 0.4))
+            child.send_signal(number)
+            code, told = child.wait(), said.read_text()
+            if code == 0:
+                break
+            assert code == (-number if number == signal.SIGKILL else 130), told
+            assert number == signal.SIGKILL or told.strip().splitlines()[-1].startswith("stopped")
+            assert not (broken / "result.npy").exists()
+        assert start(broken).wait() == 0, said.read_text()
+        np.testing.assert_array_equal(np.load(broken / "result.npy"), np.load(straight / "result.npy"))
+        assert start(broken, "--seed", "3").wait() == 2
+    assert "seed is 0 there and 3 here" in said.read_text()
     assert sorted(path.name for path in broken.iterdir()) == [".lock", "result.npy", "run.json"]

@@ -51,5 +51,10 @@ def main(options):
                 np.save(path, state)
 
 
-if __name__ == "__main__":
+def cli():
+    """Command line."""
     run(Options, main, __doc__, positional=False)
+
+
+if __name__ == "__main__":
+    cli()

@@ -48,7 +48,7 @@ def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: flo
     rates = rows[:, 2:]
     if not np.isfinite(rates).all():
         rates = np.gradient(np.unwrap(rows[:, :2], axis=0), t, axis=0)
-    return np.column_stack(twist_of_wheels(*rates.T, wheel_radius, track))
+    return np.column_stack(twist_of_wheels(rates[:, 0], rates[:, 1], wheel_radius, track))
 
 
 def joint_row(state: Any) -> tuple[float, float, float, float]:

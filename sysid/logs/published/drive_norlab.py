@@ -75,7 +75,8 @@ def most_runs(folder: Path) -> tuple[str, ...]:
     robots: dict[str, list[str]] = {}
     for run in (run for run, path in drive_files(folder).items() if path.suffix != ".csv"):
         robots.setdefault(drive_spec(run).name, []).append(run)
-    return tuple(max(robots.values(), key=len))
+    most = max(robots.values(), key=len)
+    return tuple(most)
 
 
 def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
