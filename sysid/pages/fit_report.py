@@ -259,8 +259,12 @@ def track_notes(replays: Sequence[Prediction], fit: Fit, spec: VehicleSpec) -> l
     track = effective_track(replays, spec.track, scale)
     if track is None:
         return []
-    return [f"The effective track is {track:.4g} m, {track / spec.track:.3g} times the stated one. Wheels that slide "
-            "in every turn do not determine the track between them: it is taken as stated."]
+    found = [f"The effective track is {track:.4g} m, {track / spec.track:.3g} times the stated one. Wheels that slide "
+             "in every turn do not determine the track between them: it is taken as stated."]
+    if "pose_mount.x" in fit.space.names:
+        found.append("How far ahead the tracked point lies follows from the point about which the vehicle turns. Loads "
+                     "and grip of sliding wheels move that by centimetres, so measure it.")
+    return found
 
 
 def _notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial]) -> list[str]:

@@ -18,11 +18,11 @@ WRONG = Wrong(radius=0.02, track=-0.03, x=0.05, y=-0.02)
 
 
 def commands() -> dict[str, np.ndarray]:
-    """A straight line and a turn on the spot, and an S: 6 s each."""
-    t = np.arange(60) / 10
-    moving = (t >= 1) & (t < 5.3)
-    spot = np.stack([t, 0.4 * (moving & (t < 2.5)), 0.9 * (moving & (t >= 2.5))], axis=-1)
-    bend = np.stack([t, 0.4 * moving, 0.9 * np.sin(2 * (t - 1)) * moving], axis=-1)
+    """A straight line and a turn on the spot, and a straight line and an S: 9 s each."""
+    t = np.arange(90) / 10
+    first, then = (t >= 1) & (t < 4.5), (t >= 4.5) & (t < 8.2)
+    spot = np.stack([t, 0.7 * first, 0.9 * then], axis=-1)
+    bend = np.stack([t, 0.7 * first + 0.4 * then, 0.9 * np.sin(2 * (t - 4.5)) * then], axis=-1)
     return {"spot": spot, "bend": bend}
 
 
@@ -59,6 +59,7 @@ def test_parameters_of_the_file_keep_its_contacts(tmp_path):
     assert not steps_mjx(str(file), parameters=("slip_traction.mu",))
 
 
+@pytest.mark.parametrize("robot", ["crawler"], indirect=True)
 def test_radius_and_tracked_point_of_a_skid_steered_robot_come_out_of_two_drives(robot):
     log, file = robot
     names = ("wheel_radius_difference.common", "slip_traction.mu", "slip_traction.slip_speed",
@@ -68,7 +69,7 @@ def test_radius_and_tracked_point_of_a_skid_steered_robot_come_out_of_two_drives
                        effects=("wheel_radius_difference", "pose_mount"))
     fit = fit_log(log, config)
     found = {one.name: one.value for one in fit.uncertainty.estimates}
-    assert found["wheel_radius_difference.common"] == pytest.approx(WRONG.radius, abs=0.003)
+    assert found["wheel_radius_difference.common"] == pytest.approx(WRONG.radius, abs=0.004)
     assert found["pose_mount.y"] == pytest.approx(WRONG.y, abs=0.005)
     assert found["pose_mount.yaw"] == pytest.approx(WRONG.yaw, abs=np.radians(0.3))
     before, after = predict(fit, log.trials)
