@@ -189,7 +189,6 @@ def skids(config: Benchmark) -> dict[str, dict]:
             "mount_side_mm": (1000 * abs(found["pose_mount.y"] - wrong.y), "mm"),
             "mount_ahead_mm": (1000 * abs(found["pose_mount.x"] - wrong.x), "mm"),
             "mount_deg": (abs(math.degrees(found["pose_mount.yaw"] - wrong.yaw)), "deg"),
-            "fit_s": (fit.seconds, "s"),
         }
         print(f"{name}: as stated: {', '.join(fit.stated) or 'nothing'}")
         figures |= {f"skid_{name}_{what}": figure([float(value)], unit) for what, (value, unit) in values.items()}
