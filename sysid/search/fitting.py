@@ -38,6 +38,8 @@ from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 
 PASSIVE = "slip_traction.mu_free"
+CENTRE = ("body.com_x", "body.com_y", "body.com_z")
+"""Of a skid-steered robot they move the point about which it turns; to a log the tracked point's place is the same."""
 INSTEAD = ("{} is skid-steered: the simulator's vehicle is fitted in its place, with the file's mass distribution and "
            "places of wheels")
 
@@ -230,7 +232,7 @@ def _subject(
     if model is not None and config.vehicle is not None:
         raise ValueError(f"{config.vehicle}: a vehicle file says nothing about the model {model.name!r}. Leave "
                          "--vehicle or --model out.")
-    start = None
+    start, start_of_file = None, model is not None and model.instead is not None
     if model is not None and model.instead is not None:
         start, model = model.instead(log.spec).params, None
     elif model is None and log.fields.get("input") == "wheels":
@@ -259,8 +261,10 @@ def _subject(
         sizes = models.calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
         params = models.with_effects(params, (*config.effects, *measured, *sizes, *models.gyro_effects(trials)))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
-        if log.spec.drive == "skid" and PASSIVE in space.names and PASSIVE not in config.parameters:
-            space = space.without(PASSIVE, "all wheels are driven")
+        kept = dict.fromkeys((PASSIVE,), "all wheels are driven") if log.spec.drive == "skid" else {}
+        kept |= dict.fromkeys(CENTRE, "the robot's file states it") if start_of_file else {}
+        for name, why in kept.items():
+            space = space.without(name, why) if name in space.names and name not in config.parameters else space
     if model is None or model.around:  # else a person chose what is fitted
         space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     return model, plant, params, space, intervals

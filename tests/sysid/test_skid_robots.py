@@ -48,7 +48,11 @@ def test_the_simulators_vehicle_is_fitted_with_the_files_mass_and_places_of_whee
     names = set(given.space.names)
     assert {"wheel_radius_difference.common", "slip_traction.mu", "slip_traction.slip_speed",
             "slip_traction.side_slip_speed", "yaw_scrub.torque", "pose_mount.x"} <= names
-    assert not {"track_width.error", "wheels.radius"} & names
+    assert not {"track_width.error", "wheels.radius", "slip_traction.mu_free"} & names
+    held = dict(given.space.fixed)
+    assert all(held[f"body.com_{axis}"] == "the robot's file states it" for axis in "xyz")
+    asked = make_problem(seen, FitConfig(model=str(file), physics_dt=0.01, parameters=("body.com_x",)), model=model)
+    assert asked.space.names == ("body.com_x",)
 
 
 @pytest.mark.quick
