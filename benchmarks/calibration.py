@@ -3,10 +3,12 @@
     python -m benchmarks.calibration                     # drives and fits it
     python -m benchmarks.calibration --robot porter --file mjcf      # one of 9 kg, from a file with motors
     python -m benchmarks.calibration --parts mounts      # markers 0.2 m and 15 degrees off, on three vehicles
+    python -m benchmarks.calibration --parts skids       # skid-steered robots on four and on six wheels
     python -m benchmarks.calibration --parts files --folder ROBOTS   # loads and drives each robot file of a folder
 
 `small`: a robot of a kilogram is driven on the contact plant, which shares no code with the model, and fitted as by
 `sysid.fit LOG --model robot.urdf`. `mounts`: the same of a chair, a scooter and a robot of 21 kg, by the default fit.
+`skids`: robots that slide in every turn; what drives determine of their track is the effective one.
 `files`: every robot file of a folder is loaded, settled and driven straight on.
 
 Writes benchmarks/results/logs.json.
@@ -27,8 +29,10 @@ from benchmarks.logs import CLAIM
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.commands import nine
 from benchmarks.plant.first_day import SMALL_ONES, Day, Wrong, make_uncalibrated, slowed, write_mjcf, write_urdf
+from benchmarks.plant.skid import SKIDS, write_skid_urdf
 from sysid.command_line import progress_bar
 from sysid.logs.log import load_log
+from sysid.pages.fit_report import effective_track
 from sysid.pages.report import error_rows, summaries
 from sysid.replay.robot_check import check_robot
 from sysid.replay.robot_loading import load_robot
@@ -40,6 +44,7 @@ from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 MANOEUVRES = ("turn", "s_curve", "stop_and_go", "figure_eight")
 FARTHEST = 0.2, 15.0  # m, degrees: the tracked point from where it is believed to be, in `mounts`
 LENGTH = 12.0  # s of each manoeuvre
+SKID_SPEEDS = 0.5, 1.3  # factors on speed and yaw rate of the chair's manoeuvres
 
 
 ALL_WRONG: tuple[Literal["radius", "track", "mount", "odometry"], ...] = ("radius", "track", "mount")
@@ -50,7 +55,7 @@ class Benchmark:
     """What to measure."""
 
     parts: tuple[str, ...] = ("small",)
-    """Of small, mounts and files."""
+    """Of small, mounts, skids and files."""
     robot: Literal["small", "porter"] = "small"
     """One of 1.2 kg with quick controllers, or one of 9 kg with slow ones."""
     file: Literal["urdf", "mjcf"] = "urdf"
@@ -141,6 +146,55 @@ def mounts(config: Benchmark) -> dict[str, dict]:
             "far_mount_offset_deg": {**figure(turns, "deg"), "value": max(turns)}}
 
 
+def skid_drives(seed: int) -> dict[str, np.ndarray]:
+    """Command tables (T, 3) of manoeuvres for a skid-steered robot, which turns half as far as its wheels ask for."""
+    tables = {name: table[table[:, 0] < LENGTH] * [1.0, *SKID_SPEEDS] for name, table in nine(seed).items()
+              if name in (*MANOEUVRES, "random")}
+    for table in tables.values():
+        table[-8:, 1:] = 0.0
+    return tables
+
+
+def skids(config: Benchmark) -> dict[str, dict]:
+    """Figures of robots on four and on six wheels; radius and track are off by the usual 2 and 3 %."""
+    figures: dict[str, dict] = {}
+    wrong = Wrong(0.02, -0.03, x=0.05, y=-0.02)
+    for name, robot in SKIDS.items():
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            make_uncalibrated(folder / "log", Day(name, wrong, config.seed), config.replicates,
+                              skid_drives(config.seed))
+            settings = FitConfig(model=str(write_skid_urdf(folder / "robot.urdf", robot)), quick=config.quick,
+                                 elsewhere=config.elsewhere)
+            log = load_log(folder / "log")
+            progress, close = progress_bar(expected_steps(settings))
+            try:
+                fit = fit_log(log, settings, progress)
+            finally:
+                close()
+        before, after = predict(fit, log.trials)
+        one = summaries(error_rows(log.trials, before, after), log.trials)["summary"]["held_out"]["ground_truth"]
+        found = dict(zip(fit.space.names, fit.space.to_values(fit.u), strict=True))
+        for known in fit.uncertainty.estimates:
+            print(f"{known.name}: {known.value:.5g} ({known.low:.5g} to {known.high:.5g})")
+        held_out = [k for k, trial in enumerate(log.trials) if trial.held_out]
+        true = effective_track([log.trials[k] for k in held_out], log.spec.track)
+        track = effective_track([after[k] for k in held_out], log.spec.track, found["odometry_scale.angular"])
+        assert true is not None and track is not None  # they turn
+        values = {
+            "replicate_ratio": (one["trajectory"]["fitted"] / one["trajectory"]["noise_floor"], "ratio"),
+            "initial_ratio": (one["trajectory"]["initial"] / one["trajectory"]["noise_floor"], "ratio"),
+            "radius_error": (abs((1 + found["wheel_radius_difference.common"]) / (1 + wrong.radius) - 1), "share"),
+            "track_error": (abs(track / true - 1), "share"),
+            "mount_side_mm": (1000 * abs(found["pose_mount.y"] - wrong.y), "mm"),
+            "mount_ahead_mm": (1000 * abs(found["pose_mount.x"] - wrong.x), "mm"),
+            "mount_deg": (abs(math.degrees(found["pose_mount.yaw"] - wrong.yaw)), "deg"),
+        }
+        print(f"{name}: as stated: {', '.join(fit.stated) or 'nothing'}")
+        figures |= {f"skid_{name}_{what}": figure([float(value)], unit) for what, (value, unit) in values.items()}
+    return figures
+
+
 def files(config: Benchmark) -> dict[str, dict]:
     """How many of a folder's robot files load, settle and drive straight on."""
     paths = sorted(path for path in config.folder.rglob("*") if path.suffix in ROBOT_FILES)
@@ -163,7 +217,7 @@ def main(config: Benchmark) -> None:
     """Measure and record."""
     figures: dict[str, dict] = {}
     for part in config.parts:
-        figures |= {"small": small, "mounts": mounts, "files": files}[part](config)
+        figures |= {"small": small, "mounts": mounts, "skids": skids, "files": files}[part](config)
     for name, one in figures.items():
         print(f"{name}: {np.round(one['value'], 4)} {one['unit']}")
     print(record("logs", CLAIM, figures))

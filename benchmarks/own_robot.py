@@ -15,8 +15,10 @@ Writes benchmarks/results/logs.json.
 from __future__ import annotations
 
 import fcntl
+import hashlib
+import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,6 +36,7 @@ from sysid.logs.log import load_log, of_file
 from sysid.missing.fit_statistics import load_fitted
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.loop_report import effects as named_effects
+from sysid.pages.report import code_hashes
 from sysid.search.settings import FitConfig
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.preparation import prepare, reference_for
@@ -127,12 +130,31 @@ def names_of(config: Benchmark) -> tuple[str, ...]:
     return (*TESTED, *(f"null_{k + 1}" for k in range(config.nulls)))
 
 
+def basis(config: Benchmark) -> dict[str, Any]:
+    """What a verdict depends on beside its log: code, settings and the fitted robot. One of another basis is no result
+    of this run."""
+    fitted = config.out / "fit" / "vehicle.toml"
+    parts = (sorted(code_hashes().items()), config.days, fitted.read_text() if fitted.exists() else "")
+    return {"quick": config.quick, "key": hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}
+
+
+def drop_others(config: Benchmark, names: Iterable[str]) -> None:
+    """Remove the verdicts on these logs that are of another basis, or that failed."""
+    now = basis(config)
+    for path in (config.out / "verdicts" / f"{name}.json" for name in names):
+        if path.exists() and json.loads(path.read_text()).get("basis") != now:
+            path.unlink()
+            print(f"{path}: of other code, settings or another robot; judged again", flush=True)
+
+
 def judge(config: Benchmark) -> None:
     """Keep the verdict on each log of this part."""
     names = names_of(config)
     mine = [name for name in labels_of(config.part, names) if not config.only or name in config.only]
     loop = LoopConfig(quick=config.quick)
     ready, spec, fitted = ready_robot(config, loop)
+    drop_others(config, mine)
+    now = basis(config)
 
     def verdict_on(name: str) -> dict[str, Any]:
         number = names.index(name)
@@ -142,7 +164,8 @@ def judge(config: Benchmark) -> None:
         verdict = result.search.verdict
         found = [[one["name"], *one["class"]] for one in named_effects(result)] if verdict == "named" else []
         print(f"{name}: {verdict} {found}", flush=True)
-        return {"effect": name, "size": size_of(name) if effects else 0.0, "verdict": verdict, "named": found}
+        return {"effect": name, "size": size_of(name) if effects else 0.0, "verdict": verdict, "named": found,
+                "basis": now}
 
     run_jobs(config.out / "verdicts", mine, verdict_on)
 
@@ -151,7 +174,8 @@ def collect(config: Benchmark) -> dict[str, Any]:
     """Figures of all verdicts: right is a log whose effect is in the class of one that was named, and no other.
 
     Raises:
-        ValueError: a log has no verdict. Without it the score would be of the others alone.
+        ValueError: a log has no verdict, or one of other code, settings or another robot. The score would be of the
+            others alone, or of no one thing.
     """
     folder = config.out / "verdicts"
     names = [name for name in names_of(config) if not config.only or name in config.only]
@@ -159,6 +183,10 @@ def collect(config: Benchmark) -> dict[str, Any]:
     judged = {one["label"] for one in verdicts}
     left = [f"{name} ({'failed' if (folder / f'{name}.json').exists() else 'missing'})"
             for name in names if name not in judged]
+    now = basis(config)
+    if others := [one["label"] for one in verdicts if one.get("basis") != now]:
+        raise ValueError(f"{folder}: verdicts on {', '.join(others)} are of other code, other settings (--quick) or "
+                         "another robot. Run their parts again.")
     if left:
         raise ValueError(f"{folder}: no verdict on {', '.join(left)}. Remove the files of those that failed, and "
                          "run their parts again.")

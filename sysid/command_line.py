@@ -16,11 +16,13 @@ class OwnModels:
     """Options of a command that may step a user's robot."""
 
     model: str
+    wheels: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
 
     @property
     def shares_results(self) -> bool:
         """Whether XLA may share results: it may abort then on a user's robot."""
-        return not steps_mjx(self.model)
+        return not steps_mjx(self.model, self.wheels, self.parameters)
 
 
 _heartbeats: list[Heartbeat] = []

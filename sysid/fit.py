@@ -22,6 +22,7 @@ from sysid import command_line
 from sysid.logs.coverage import doubts
 from sysid.logs.measured import load_any
 from sysid.logs.records import Log
+from sysid.pages.fit_page import warning
 from sysid.pages.fit_report import Loaded, fit_dataset
 from sysid.pages.report import parameter_table, table
 from sysid.replay.models import Model
@@ -114,7 +115,7 @@ def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None
         report = fit_dataset(data, arguments.out, config=settings, progress=progress, model=model)
     finally:
         close()
-    for note in report["dataset"]["notes"][len(log.notes):]:
+    for note in (*filter(None, [warning(report)]), *report["dataset"]["notes"][len(log.notes):]):
         print(note)
     print(parameter_table(report))
     if report["prior"] is not None:

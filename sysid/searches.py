@@ -30,7 +30,7 @@ from sysid.logs.records import Log
 from sysid.pages.plots import write_search_plot
 from sysid.pages.report import code_hashes, write_report
 from sysid.search.comparison import METHODS, NEAR, Effort, Judge, arrivals, trace
-from sysid.search.fitting import Problem, check_settings, make_problem
+from sysid.search.fitting import Problem, check_settings, make_problem, subject
 from sysid.search.result import Trace
 from sysid.search.settings import FitConfig
 from whill_mjx.io.folders import claim_folder
@@ -70,10 +70,10 @@ def main(arguments: Arguments) -> list[Trace]:
             raise ValueError("--methods and --seeds: each needs one at least. Leave the option out for the default.")
         log = load_any(arguments.dataset)
         config = FitConfig(**{name: getattr(arguments, name) for name in FitConfig.__dataclass_fields__})
-        check_settings(log, config)
+        log, model = subject(log, config, check_settings(log, config))
     with claim_folder(arguments.out, "sysid.searches", OUTPUTS) as claim:
         claim.settle({})  # timings are made anew
-        return compare(arguments, log, make_problem(log, config))
+        return compare(arguments, log, make_problem(log, config, model=model))
 
 
 def compare(arguments: Arguments, log: Log, problem: Problem) -> list[Trace]:

@@ -23,6 +23,7 @@ from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.effects.sensing import OdometryScale
 from benchmarks.plant.make import Result, write_dataset
 from benchmarks.plant.sensors import odometry, outside_pose
+from benchmarks.plant.skid import SKIDS, Skid, SkidPlant
 from benchmarks.plant.trial import Noise, Plant
 from whill_mjx.logs.dataset import write_text
 
@@ -82,7 +83,7 @@ class Day:
     @property
     def chair(self) -> Chair:
         """The vehicle on this day, with true sizes that differ from its nominal ones."""
-        chair = (VEHICLES | SMALL_ONES)[self.vehicle]
+        chair = (VEHICLES | SMALL_ONES | SKIDS)[self.vehicle]
         if self.varies:
             chair = chair.on_day(np.random.default_rng([self.seed, 1]))
         radius = chair.nominal.radius * (1 + self.wrong.radius)
@@ -124,7 +125,8 @@ def make_uncalibrated(
         ground_truth: whether the outside pose is written.
     """
     chair, wrong, noise = day.chair, day.wrong, day.noise
-    plant = SmallPlant(chair, COULOMB) if day.small else Plant(chair)
+    plant = (SkidPlant(chair) if isinstance(chair, Skid) else SmallPlant(chair, COULOMB) if day.small else
+             Plant(chair))
     tables = dict(manoeuvres or (slowed(nine(day.seed)) if day.small else nine(day.seed)))
     results: list[Result] = []
     for replicate in range(1, replicates + 1):
@@ -140,6 +142,8 @@ def make_uncalibrated(
             results.append((f"{name}_{replicate}", odometry(drive, told, noise, reading), pose, None))
     messages_of = {f"{name}_{k}": table for name, table in tables.items() for k in range(1, replicates + 1)}
     write_dataset(out, chair.nominal, messages_of, results, ground_truth)
+    if isinstance(chair, Skid):
+        write_text(out / "dataset.toml", (out / "dataset.toml").read_text() + 'drive = "skid"\n')
     return out
 
 

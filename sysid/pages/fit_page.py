@@ -134,8 +134,36 @@ def _spoken(name: str) -> str:
     return f"{effect} {parameter}".replace("_", " ").strip()
 
 
+def warning(report: dict[str, Any]) -> str:
+    """A sentence where held-out drives are predicted worse than by what the fit began with; nothing otherwise.
+
+    What is below the floor, the spread of replicates, is no worse: nothing shows there.
+    """
+    channels = report["summary"]["held_out"]
+    channel = "ground_truth" if "trajectory" in channels.get("ground_truth", {}) else "odometry"
+    for metric, spoken in (("trajectory", _cm), ("yaw", _degrees)):
+        one = channels.get(channel, {}).get(metric)
+        if one is None or one["initial"] is None or not np.isfinite(one["initial"]):
+            continue
+        fitted = np.inf if one["fitted"] is None or not np.isfinite(one["fitted"]) else one["fitted"]  # it diverged
+        if _is_more(fitted, one["initial"]) and _is_more(fitted, one.get("noise_floor") or 0.0):
+            what = {"trajectory": "position", "yaw": "heading"}[metric]
+            return (f"This fit is worse than the vehicle as stated: on held-out drives its {what} is off by "
+                    f"{spoken(one['fitted'])}, that of the vehicle as stated by {spoken(one['initial'])}. Keep the "
+                    "stated values, and see what got worse.")
+    return ""
+
+
+def _degrees(radians: float | None) -> str:
+    return "an unknown angle" if radians is None else f"{np.degrees(radians):.2f} degrees"
+
+
 def headline(report: dict[str, Any]) -> str:
-    """Two sentences: the error that the fit is judged by, and those it is compared with."""
+    """Two sentences: the error that the fit is judged by, and those it is compared with; a warning goes first."""
+    return " ".join(one for one in (warning(report), _judged(report)) if one)
+
+
+def _judged(report: dict[str, Any]) -> str:
     part = "held_out" if report["summary"]["held_out"] else "training"
     channels = report["summary"][part]
     channel = "ground_truth" if "trajectory" in channels.get("ground_truth", {}) else "odometry"

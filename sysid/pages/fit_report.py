@@ -25,7 +25,7 @@ from sysid.pages.series import collect, save
 from sysid.replay.models import Model, Twin, describe_parameters, get_parameters, save_model
 from sysid.replay.rollout import Replay, make_batch, predictions, vehicle_plant
 from sysid.search import starts, thin
-from sysid.search.fitting import Fit, fit_log, of_earlier, predict
+from sysid.search.fitting import Fit, fit_log, predict, subject
 from sysid.search.result import Progress
 from sysid.search.settings import FitConfig
 from sysid.search.studies import without_secrets
@@ -124,7 +124,7 @@ def fit_dataset(
     config = config or FitConfig()
     config = replace(config, quick=quick or config.quick)
     data = path if isinstance(path, Loaded) else Loaded(load_any(path), path)
-    log = of_earlier(data.log, config)
+    log, model = subject(data.log, config, model)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     fit = fit_log(log, config, progress, model=model)
@@ -137,6 +137,8 @@ def fit_dataset(
     initial, fitted = predict(fit, trials)
     rows = error_rows(trials, initial, fitted)
     report = make_report(replace(data, log=log), config, fit, rows)
+    if log.spec.drive == "skid" and fit.model is None:
+        report["dataset"]["notes"] += track_notes(fitted[: len(log.training)], fit, log.spec)
     twin = None if fit.model is None or fit.model.vehicle is None else fit.model.vehicle(fit.params, log.spec)
     if isinstance(twin, str):
         report["dataset"]["notes"].append(f"no vehicle of the simulator is written: {twin}")
@@ -200,6 +202,8 @@ def _distance(trial: Trial, replay: Prediction) -> float:
     return float(found["ground_truth" if trial.ground_truth is not None else "odometry"].trajectory or 0.0)
 
 
+SCALE = "odometry_scale.angular"
+TURNS = 0.05  # rad, standard deviation of the yaw, below which drives do not turn
 LEAST = 5e-4  # share of a size, or of a scale, that counts as nothing
 SIZES = {
     "wheel radius": ("wheel_radius_difference.common", "wheels.radius"),
@@ -222,6 +226,45 @@ def calibration_notes(
         notes.append(f"Stated values are kept for {', '.join(kept)}: free ones did not predict held-back drives "
                      "better.")
     return notes
+
+
+def effective_track(drives: Sequence[Prediction | Trial], track: float, scale: float = 1.0) -> float | None:
+    """Track [m] of a robot on two wheels that turns as far by the same wheel speeds; None where no drive turns.
+
+    The odometry's yaw over that of the outside pose, times the track that it takes.
+
+    Args:
+        drives: with both.
+        track: of the odometry [m].
+        scale: of the odometry's yaw over that of its wheels.
+    """
+    along, turned, samples = 0.0, 0.0, 0
+    for drive in drives:
+        pose, odometry = drive.ground_truth, drive.odometry
+        if pose is None or odometry is None or odometry.yaw is None or len(pose.t) < 2:
+            continue
+        yaw = np.interp(odometry.t, pose.t, pose.yaw)
+        yaw, wheels = yaw - yaw.mean(), odometry.yaw - np.mean(odometry.yaw)
+        along, turned = along + float(yaw @ wheels), turned + float(yaw @ yaw)
+        samples += len(yaw)
+    if turned <= samples * TURNS**2:
+        return None
+    return along / turned * track / scale
+
+
+def track_notes(replays: Sequence[Prediction], fit: Fit, spec: VehicleSpec) -> list[str]:
+    """What a skid-steered vehicle's drives determine of its track, by fitted replays of them."""
+    names = list(describe_parameters(fit.params))
+    scale = float(get_parameters(fit.params, [SCALE])[0]) if SCALE in names else 1.0
+    track = effective_track(replays, spec.track, scale)
+    if track is None:
+        return []
+    found = [f"The effective track is {track:.4g} m, {track / spec.track:.3g} times the stated one. Wheels that slide "
+             "in every turn do not determine the track between them: it is taken as stated."]
+    if "pose_mount.x" in fit.space.names:
+        found.append("How far ahead the tracked point lies follows from the point about which the vehicle turns. Loads "
+                     "and grip of sliding wheels move that by centimetres, so measure it.")
+    return found
 
 
 def _notes(estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial]) -> list[str]:

@@ -18,6 +18,7 @@ The constants that MuJoCo derives from masses to soften contacts keep their nomi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, resolve, turning_inertia, write_mjcf
 from sysid.replay.robot_rest import FALLS
 from sysid.replay.robot_sizes import SIZES, Size, sizes_of
-from sysid.replay.robot_vehicle import vehicle_of
+from sysid.replay.robot_vehicle import skid_vehicle, vehicle_of
 from whill_mjx.processor import shares_results
 from whill_mjx.vehicle.model import import_mjx
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -78,7 +79,8 @@ def mjcf_model(
         timestep: physics step [s]; by default the file's.
         effects: of the catalogue, around the model; for example command_delay.
         calibrate: also fit true radii and track (`wheels.radius`, `wheels.difference`, `wheels.track`), and delays,
-            scales and the tracked point around the model, where a log shows them.
+            scales and the tracked point around the model, where a log shows them. Of a skid-steered robot a fit takes
+            the vehicle of the simulator in its place (`sysid.replay.robot_vehicle`).
         room_fixed: it matters where in the room it starts; by default where the world has more than planes in it.
 
     FileNotFoundError or ValueError names the file, the rule and the remedy.
@@ -105,7 +107,9 @@ def mjcf_model(
     def vehicle(params: Parameters, spec: VehicleSpec) -> Twin | str:
         return vehicle_of(robot, entries, params, spec)
 
-    return Model(robot.path.name, plant, params, write, robot.notes, around, vehicle).with_effects(effects)
+    skids = calibrate and len(robot.wheels) > 2
+    return Model(robot.path.name, plant, params, write, robot.notes, around, vehicle,
+                 partial(skid_vehicle, robot) if skids else None).with_effects(effects)
 
 
 def _searched(

@@ -13,16 +13,26 @@ from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
 
-def steps_mjx(text: str | None) -> bool:
-    """Whether `--model TEXT` steps a user's robot by MJX: a robot file, or a Python file that mentions it."""
+def steps_mjx(text: str | None, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> bool:
+    """Whether `--model TEXT` steps a user's robot by MJX: a robot file, or a Python file that mentions it. The vehicle
+    that is fitted in place of a skid-steered robot is stepped by our own physics."""
     path = Path(text.partition(".py:")[0] + ".py" if text and ".py:" in text else text or "")
+    if path.suffix in ROBOT_FILES:
+        from sysid.replay.robot_loading import count_wheels
+
+        return bool(_inside(parameters)) or count_wheels(path, wheels) <= 2
     if path.suffix != ".py":
-        return path.suffix in ROBOT_FILES
+        return False
     try:
         source = path.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return False  # `load_model` says so
     return re.search(r"mjcf_model|\bmjx\b", source) is not None
+
+
+def _inside(parameters: Sequence[str]) -> list[str]:
+    """Those that are of a robot's file, and not of effects or a vehicle of the simulator."""
+    return [name for name in parameters if name.partition(".")[0] not in EFFECTS]
 
 
 def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> Model:
@@ -42,7 +52,7 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
     if path.suffix in ROBOT_FILES:
         from sysid.replay.mjcf import mjcf_model
 
-        inside = [name for name in parameters if name.partition(".")[0] not in EFFECTS]
+        inside = _inside(parameters)
         return mjcf_model(path, inside or None, wheels=wheels, wheel_radius=spec.wheel_radius, track=spec.track,
                           calibrate=not inside)
     if path.suffix != ".py":

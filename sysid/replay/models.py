@@ -67,6 +67,8 @@ class Model:
     around: tuple[str, ...] = ()  # effects that it may have around it: a fit adds those that a log shows
     vehicle: Callable[[Parameters, VehicleSpec], Twin | str] | None = None
     """The vehicle of the simulator that drives alike, or why there is none."""
+    instead: Callable[[VehicleSpec], Twin] | None = None
+    """The vehicle of the simulator that a fit takes in its place, of a log's spec; none where it fits the model."""
 
     def with_effects(self, names: Sequence[str]) -> Model:
         """The same model with effects of the catalogue around it; ValueError for those that act inside one."""

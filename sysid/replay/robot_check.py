@@ -104,6 +104,9 @@ def describe_robot(robot: Robot, check: Check) -> list[str]:
               f"speed, turning {np.degrees(check.drift):+.2f} degrees/s",
               f"  on the spot at {check.command[1]:.3g} rad/s: {check.rate / check.command[1]:.1%} of the commanded "
               "rate"]
+    if count > 2:
+        lines.append("  How far it turns follows from how its wheels slide: a fit takes a vehicle of the simulator in "
+                     "place of these contacts.")
     missing = [*robot.notes, *_missing(robot, check)]
     return [*lines, "", "Missing, replaced or odd", *(f"  {one}" for one in missing or ["nothing"])]
 

@@ -77,6 +77,15 @@ def load_robot(
                  falls=len(ids) == 2 and falls(host, data.qpos.copy(), speed, body, rotation.T @ left))
 
 
+def count_wheels(path: Path, wheels: Sequence[str] = ()) -> int:
+    """How many driven wheels a file has; 0 where it cannot be used, which `load_robot` explains."""
+    try:
+        file = read_robot(path, wheels, None)
+        return len(wheel_joints(path, file.spec, wheels, file.drive))
+    except (ValueError, KeyError, OSError, mujoco.FatalError, mujoco.UnexpectedError):
+        return 0
+
+
 @dataclass
 class _Draft:
     """A robot while it is completed."""

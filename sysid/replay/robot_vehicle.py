@@ -1,7 +1,13 @@
-"""A fitted robot as a vehicle of the simulator, where its kind has one: two driven wheels and supports that slide.
+"""A robot as a vehicle of the simulator, where its kind has one.
 
-What the fit knows goes over value by value: mass distribution, true sizes of wheels, controller, friction, and all
-effects around it. What a contact solver has no number for, such as how a tyre creeps, is taken for stiff.
+Two driven wheels and supports that slide: what a fit of the robot knows goes over value by value, namely mass
+distribution, true sizes of wheels, controller, friction, and all effects around it. What a contact solver has no number
+for, such as how a tyre creeps, is taken for stiff.
+
+Skid-steered: the vehicle is fitted in place of the robot. Rigid wheels on a rigid frame chatter in MuJoCo's contacts
+while they slide, so that a change of 0.01 % of a size turns the robot otherwise by 5 % of a quarter turn, and how far
+it turns follows from the rotors' inertia, which is not that of a real tyre. The vehicle's tyres have a law of sliding
+whose grip along and across is fitted.
 """
 
 from __future__ import annotations
@@ -16,9 +22,10 @@ import numpy as np
 from sysid.replay.models import Parameters, Twin, describe_parameters, with_effects
 from sysid.replay.robot import Robot
 from sysid.replay.robot_parameters import Entry, Overlaid
+from sysid.replay.robot_servos import ROTOR_SHARE
 from sysid.replay.robot_sizes import Size
 from whill_mjx.vehicle.parameters import set_values
-from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.presets import in_short, preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
@@ -37,7 +44,7 @@ def vehicle_of(
     """
     values = {name: float(value) for name, value in params.values.items()}
     if len(robot.wheels) != 2:
-        return "a skid-steered robot's wheels slide in another way than a vehicle's"
+        return "what was fitted of a skid-steered robot are parameters of its contacts, which a vehicle does not have"
     if not set(DRIVE) <= set(values) or "wheels.radius" not in values:
         return "sizes and controller were not fitted"
     if not robot.sliding:
@@ -45,10 +52,12 @@ def vehicle_of(
     arrays: dict[str, np.ndarray] = {}
     for name, entry in entries.items():
         arrays.update(entry.changes(Overlaid(robot.host, arrays), values[name]))
-    mass, com, yaw_inertia, ahead, share = _at_rest(robot, arrays)
+    mass, com, yaw_inertia = _mass_of(robot, arrays)
+    ahead = _ahead(robot, _rested(robot).geom_xpos[list(robot.sliding)])
     if ahead.min() < 0 < ahead.max():
         return "it stands on supports before and behind its axle"
     support = float(ahead.mean())
+    share = float(np.clip(com[0] / support, 0.0, 1.0))  # of the weight, that the supports carry
     low, high = extent_of(robot)
     length, width, height = (high - low).tolist()
     spec = replace(spec, mass=mass, drive="differential", driven_axle="rear" if support > 0 else "front",
@@ -83,38 +92,77 @@ def vehicle_of(
     return Twin(spec, VehicleParams(vehicle.body, effects), shared)
 
 
-def _at_rest(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.ndarray, float, np.ndarray, float]:
-    """Mass, its centre (3,) from the axle's middle, yaw inertia about it, places of supports ahead of the axle, and the
-    share of the weight that they carry."""
-    host, data = robot.host, mujoco.MjData(robot.host)
+def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
+    """The vehicle of the simulator that a skid-steered robot's file describes, where a fit begins.
+
+    It has four wheels: more are taken for four at the distance from the middle that resists turning as much, the root
+    mean square of theirs.
+
+    `spec`: of the log, with stated sizes and limits.
+    """
+    host = robot.host
+    data = _rested(robot)
+    axles = _ahead(robot, data.xanchor[list(robot.joints)])
+    half = round(float(np.sqrt(np.square(axles - axles.mean()).mean())), 6)
+    mass, com, yaw_inertia = _mass_of(robot, {})
+    low, high = extent_of(robot)
+    length, width, height = (high - low).tolist()
+    bare = robot.spin - float(np.mean(host.dof_armature[list(robot.wheels)]) if robot.added else 0.0)
+    wheels = len(robot.wheels) // 2
+    spin = max(bare, ROTOR_SHARE * mass * robot.wheel_radius**2 / len(robot.wheels))
+    spec = replace(spec, mass=mass, drive="skid", wheelbase=2 * half, rear_axle_x=-half - float(low[0] + high[0]) / 2,
+                   wheel_inertia=wheels * spin, body_length=length, body_width=width, body_height=height)
+    found = {"body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
+             "body.com_y": com[1], "body.com_z": com[2]}
+    params = set_values(in_short(spec, "physical"), list(found), jnp.asarray(list(found.values()),
+                                                                            jnp.result_type(float)))
+    return Twin(spec, params, {})
+
+
+def _rested(robot: Robot) -> Any:
+    data = mujoco.MjData(robot.host)
     data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(host, data)
-    mujoco.mj_comPos(host, data)
+    mujoco.mj_kinematics(robot.host, data)
+    mujoco.mj_comPos(robot.host, data)
+    return data
+
+
+def _axes(robot: Robot, data: Any) -> np.ndarray:
+    """(3, 3) ahead, to the left and up, in the room."""
+    ahead = data.xmat[_root(robot)].reshape(3, 3) @ robot.forward
+    return np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
+
+
+def _root(robot: Robot) -> int:
+    return int(robot.host.body_rootid[robot.host.jnt_bodyid[robot.joints[0]]])
+
+
+def _ahead(robot: Robot, places: np.ndarray) -> np.ndarray:
+    """How far places (K, 3) in the room are ahead of the middle of the driven wheels, at rest [m]."""
+    data = _rested(robot)
+    return (places - data.xanchor[list(robot.joints)].mean(0)) @ _axes(robot, data)[0]
+
+
+def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.ndarray, float]:
+    """Mass, its centre (3,) from the middle of the driven wheels, and yaw inertia about it; `arrays` of the model are
+    replaced."""
+    host, data = robot.host, _rested(robot)
     model: Any = Overlaid(host, arrays)
-    root = int(host.body_rootid[host.jnt_bodyid[robot.joints[0]]])
-    turn = data.xmat[root].reshape(3, 3)
-    axle = data.xanchor[list(robot.joints)].mean(0)
-    ahead = turn @ robot.forward
-    axes = np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
-    bodies = np.flatnonzero(host.body_rootid == root)
-    masses, places = model.body_mass[bodies], (data.xipos[bodies] - axle) @ axes.T
+    bodies = np.flatnonzero(host.body_rootid == _root(robot))
+    middle = data.xanchor[list(robot.joints)].mean(0)
+    masses, places = model.body_mass[bodies], (data.xipos[bodies] - middle) @ _axes(robot, data).T
     mass = float(masses.sum())
     centre = masses @ places / mass
     upright = np.square(data.ximat[bodies].reshape(-1, 3, 3)[:, 2])
     inertia = (upright * model.body_inertia[bodies]).sum() + masses @ np.square(places - centre)[:, :2].sum(1)
-    supports = ((data.geom_xpos[list(robot.sliding)] - axle) @ axes.T)[:, 0]
-    return mass, centre, float(inertia), supports, float(np.clip(centre[0] / supports.mean(), 0.0, 1.0))
+    return mass, centre, float(inertia)
 
 
 def extent_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest place (3,) of its geoms at rest: ahead of the driven axle's middle, to the left and up [m]."""
-    host, data = robot.host, mujoco.MjData(robot.host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(host, data)
-    root = int(host.body_rootid[host.jnt_bodyid[robot.joints[0]]])
-    ahead = data.xmat[root].reshape(3, 3) @ robot.forward
-    axes = np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
-    geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == root)
+    host, data = robot.host, _rested(robot)
+    axes = _axes(robot, data)
+    geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == _root(robot))
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     middle = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, host.geom_aabb[geoms, :3])
     middle = (middle - data.xanchor[list(robot.joints)].mean(0)) @ axes.T

@@ -37,6 +37,12 @@ from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 
+PASSIVE = "slip_traction.mu_free"
+CENTRE = ("body.com_x", "body.com_y", "body.com_z")
+"""Of a skid-steered robot they move the point about which it turns; to a log the tracked point's place is the same."""
+INSTEAD = ("{} is skid-steered: the simulator's vehicle is fitted in its place, with the file's mass distribution and "
+           "places of wheels")
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -78,7 +84,7 @@ def fit_log(
     config = config or FitConfig()
     check_options(config)
     began = time.perf_counter()
-    log = of_earlier(log, config)
+    log, model = subject(log, config, model)
     given = make_problem(log, config, params, model)
     if given.plant.host is not None:
         config = replace(config, elsewhere=False)
@@ -201,8 +207,7 @@ def make_problem(log: Log, config: FitConfig, params: Any = None, model: Model |
 
 def check_settings(log: Log, config: FitConfig) -> Model | None:
     """Raise ValueError or FileNotFoundError for settings that cannot fit a log; returns the model that they name."""
-    model = load_model(config.model, log.spec, config.wheels, config.parameters) if config.model else None
-    log = of_earlier(log, config)
+    log, model = subject(log, config)
     space = _subject(log, config, _training(log, config), None, model)[3]
     profiled(space, config)
     return model
@@ -224,12 +229,15 @@ def _subject(
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
-    if model is None and log.fields.get("input") == "wheels":
+    if model is not None and config.vehicle is not None:
+        raise ValueError(f"{config.vehicle}: a vehicle file says nothing about the model {model.name!r}. Leave "
+                         "--vehicle or --model out.")
+    start, start_of_file = None, model is not None and model.instead is not None
+    if model is not None and model.instead is not None:
+        start, model = model.instead(log.spec).params, None
+    elif model is None and log.fields.get("input") == "wheels":
         model = wheel_model(log.spec)
     if model is not None:
-        if config.vehicle is not None:
-            raise ValueError(f"{config.vehicle}: a vehicle file says nothing about the model {model.name!r}. Leave "
-                             "--vehicle or --model out.")
         alone: tuple[str, ...] = ()
         model = model.with_effects((*config.effects, *models.gyro_effects(trials)))
         if config.calibrate and not config.parameters:
@@ -246,12 +254,17 @@ def _subject(
         given = params is not None
         if config.vehicle is not None:
             params, intervals = _earlier(config.vehicle)
-        params = preset_params(log.spec, config.preset) if params is None else params
+        start = preset_params(log.spec, config.preset) if start is None else start
+        params = start if params is None else params
         receipt = log.fields.get("pose_stamps") == "receipt"
         measured = () if given else models.measured_effects(params, log.spec, trials, receipt=receipt)
         sizes = models.calibration_effects(params, log.spec, trials) if config.calibrate and not given else ()
         params = models.with_effects(params, (*config.effects, *measured, *sizes, *models.gyro_effects(trials)))
         space = make_space(params, log.spec, config.parameters or searched(params, config.effects))
+        kept = dict.fromkeys((PASSIVE,), "all wheels are driven") if log.spec.drive == "skid" else {}
+        kept |= dict.fromkeys(CENTRE, "the robot's file states it") if start_of_file else {}
+        for name, why in kept.items():
+            space = space.without(name, why) if name in space.names and name not in config.parameters else space
     if model is None or model.around:  # else a person chose what is fitted
         space = thin.without_hidden(space, log.select(lambda one: not one.held_out), config.parameters)
     return model, plant, params, space, intervals
@@ -265,6 +278,23 @@ def profiled(space: Space, config: FitConfig) -> tuple[str, ...]:
         raise ValueError(f"--profile with --method {config.method}: a global search ends beside the minimum that a "
                          "profile starts from. Use --method features, lm or both.")
     return wanted
+
+
+def subject(log: Log, config: FitConfig, model: Model | None = None) -> tuple[Log, Model | None]:
+    """The log as one of the vehicle that is fitted, and the model that is given or that the settings name.
+
+    Where a vehicle of the simulator takes the model's place, sizes and inertias that the log does not state are those
+    of the model's file. ValueError or FileNotFoundError for settings that name neither.
+    """
+    log = of_earlier(log, config)
+    if model is None and config.model:
+        model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    if model is None or model.instead is None:
+        return log, model
+    spec = model.instead(log.spec).spec
+    log = of_file(replace(log, spec=replace(log.spec, drive=spec.drive)), spec, model.name)
+    new = [note for note in (INSTEAD.format(model.name), *model.notes) if note not in log.notes]
+    return replace(log, notes=(*log.notes, *new)), model
 
 
 def of_earlier(log: Log, config: FitConfig) -> Log:
