@@ -83,10 +83,10 @@ def fit_log(
     if given.plant.host is not None:
         config = replace(config, elsewhere=False)
     space, objective = given.space, given.objective
+    wanted = profiled(space, config)
     if isinstance(objective.replay, DifferenceReplay):
         for trials in (objective.trials, odometry_frames.at_frames((*log.training, *log.held_out), given.frame)):
             objective.replay.compile(trials)  # `predict` replays all of them
-    wanted = profiled(space, config)
     iterations = min(config.iterations, settings.QUICK_ITERATIONS) if config.quick else config.iterations
     stages = Stages(progress, 1 if config.method in settings.GLOBAL else 3 if config.method == "lm" else 4)
     scan, coarse, points = _first_points(log, given, config, stages)
