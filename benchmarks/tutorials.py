@@ -261,9 +261,10 @@ def computed() -> float:
     return sum(os.times()[:4])
 
 
-def run_all(given: argparse.Namespace) -> dict[str, float]:
-    """Run the pages in a row; the figures of each, such as notebook_2_s and notebook_2_cpu_s [s]."""
-    kind, figures = "notebook" if given.notebooks else "tutorial", dict[str, float]()
+def run_all(given: argparse.Namespace) -> None:
+    """Run the pages in a row. The figures of each, such as notebook_2_s and notebook_2_cpu_s [s], are recorded as soon
+    as it has ended: a later page that fails takes none away."""
+    kind = "notebook" if given.notebooks else "tutorial"
     for page in pages():
         number = page.name[0]
         if number in given.pages:
@@ -271,9 +272,9 @@ def run_all(given: argparse.Namespace) -> dict[str, float]:
             began, before = time.perf_counter(), computed()
             (run_notebook if given.notebooks else run_page)(page, tests=given.tests)
             taken, cores = time.perf_counter() - began, computed() - before
-            figures |= {f"{kind}_{number}_s": taken, f"{kind}_{number}_cpu_s": cores}
             print(f"== {page.name}: {taken:.0f} s, {cores:.0f} s of all cores together", flush=True)
-    return figures
+            if given.record:
+                print(write_figures({f"{kind}_{number}_s": taken, f"{kind}_{number}_cpu_s": cores}), flush=True)
 
 
 def write_figures(seconds: dict[str, float]) -> Path:
@@ -303,11 +304,9 @@ def main() -> None:
             print("\n".join(map(str, write_notebooks(given.out))))
             return
         with tempfile.TemporaryDirectory() as own, workplace((given.out or Path(own)).absolute()):
-            seconds = run_all(given)
+            run_all(given)
     except ModuleNotFoundError as error:
         parser.error(f"{error.name} is not installed. Install it: pip install -c constraints.txt -e '.[docs]'.")
-    if given.record:
-        print(write_figures(seconds))
 
 
 if __name__ == "__main__":

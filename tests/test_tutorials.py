@@ -85,6 +85,19 @@ def test_a_cell_of_a_notebook_fails_with_any_of_its_lines(tmp_path):
         tutorials.run_notebook(page)
 
 
+@pytest.mark.quick
+def test_what_a_page_took_is_recorded_though_a_later_one_fails(tmp_path, monkeypatch):
+    for name, line in (("1_first.md", "true"), ("2_second.md", "false")):
+        (tmp_path / name).write_text(f"# Page\n\n```sh\n{line}\n```\n")
+    recorded = {}
+    monkeypatch.setattr(tutorials, "TUTORIALS", tmp_path)
+    monkeypatch.setattr(tutorials, "write_figures", recorded.update)
+    monkeypatch.setattr("sys.argv", ["tutorials", "run", "--record", "--out", str(tmp_path / "out")])
+    with pytest.raises(RuntimeError, match=r"2_second.md, line 4"):
+        tutorials.main()
+    assert set(recorded) == {"tutorial_1_s", "tutorial_1_cpu_s"}
+
+
 @pytest.mark.parametrize("name", QUICK)
 def test_the_quick_tutorials_run(name, tmp_path):
     with workplace(tmp_path):

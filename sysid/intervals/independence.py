@@ -41,7 +41,7 @@ class Sandwich:
 
     def variances(self, scores: np.ndarray) -> np.ndarray:
         """(N, P) diagonals of covariances, from scores (N, G, P)."""
-        return np.square(np.einsum("gpq,ngq->ngp", self.moves, scores, optimize=True)).sum(1)
+        return np.square(scores.swapaxes(0, 1) @ self.moves.swapaxes(1, 2)).sum(0)
 
 
 def sandwich(blocks: np.ndarray, inverse: np.ndarray) -> Sandwich:

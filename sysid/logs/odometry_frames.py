@@ -123,9 +123,12 @@ def ages_of(t: np.ndarray, period: float, phase: np.ndarray | float) -> np.ndarr
 
 def _left(part: Stretches, period: float, phases: np.ndarray) -> np.ndarray:
     """Squared ways (K, S) that frames of each phase leave."""
-    along = part.steps + ages_of(part.t, period, phases[:, None, None])  # (K, S, ROWS); steps have no parabola in them
-    curve = np.einsum("sjc,ksj->ksc", part.parabola, along)
-    return part.weight[:, 0] ** 2 * (np.square(along).sum(2) - np.square(curve).sum(2))
+    t, steps = (np.ascontiguousarray(one.T)[:, None] for one in (part.t, part.steps))  # sums over rows: whole arrays
+    along = steps + ages_of(t, period, phases[:, None])  # (ROWS, K, S); steps have no parabola in them
+    squares = np.einsum("jks,jks->ks", along, along)
+    for column in np.ascontiguousarray(part.parabola.T):
+        squares -= np.square(np.einsum("js,jks->ks", column, along))
+    return part.weight[:, 0] ** 2 * squares
 
 
 def _best_rate(

@@ -19,11 +19,10 @@ def on_processor() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def on_all_cores(work: Callable[[_Part], _Done], parts: Sequence[_Part], compiled: bool = True) -> list[_Done]:
-    """What `work` gives for each of `parts`, side by side on all cores; unless `compiled`, the first goes ahead."""
+def on_all_cores(work: Callable[[_Part], _Done], parts: Sequence[_Part]) -> list[_Done]:
+    """What `work` gives for each of `parts`, side by side on all cores."""
     workers = min(cores(), len(parts))
     if workers < 2:
         return [work(part) for part in parts]
-    ahead = [] if compiled else [work(parts[0])]
     with ThreadPoolExecutor(workers) as threads:
-        return [*ahead, *threads.map(work, parts[len(ahead) :])]
+        return list(threads.map(work, parts))

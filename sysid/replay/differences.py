@@ -19,7 +19,6 @@ from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.pose_objective import Replays
@@ -31,7 +30,7 @@ from sysid.replay.cores import on_processor
 from sysid.replay.models import Parameters, set_parameters
 from sysid.replay.on_host import HostReplay
 from sysid.replay.records import ODOMETRY, POSE, TURN, Measured, Plant, Simulated
-from sysid.replay.rollout import PathReplay, Replay, make_batch
+from sysid.replay.rollout import PathReplay, Replay, make_batch, sent
 
 VECTOR, FEW, MANY = 8, 32, 128
 """Drives that a core replays together fill its vectors, of so many numbers (20 take longer than 24), and are about so
@@ -49,7 +48,7 @@ class CourseReplay:
         room, every trial is a course. `paths`: compiled programs of the same plant and `set_values`."""
         batch, self.measured = make_batch(trials, plant.dt)
         command, start = np.asarray(batch.command), np.asarray(batch.start, float)
-        self._anywhere, self._record = anywhere, plant.dt * command.shape[2]
+        self._anywhere, self._dt, self._record = anywhere, plant.dt, plant.dt * command.shape[2]
         seen: dict[bytes, int] = {}
         keys = [command[i].tobytes() + start[i, 3 if anywhere else 0 :].tobytes() for i in range(len(trials))]
         self._course = np.array([seen.setdefault(key, len(seen)) for key in keys])  # (B,)
@@ -61,16 +60,13 @@ class CourseReplay:
         records = command.shape[1]
         every = np.tile(np.minimum(np.arange(records + 1), records - 1), (self.courses, 1))
         last = np.tile((np.arange(records + 1) == records).astype(float), (self.courses, 1))
-        float_type = jnp.result_type(float)
-        whole = replace(batch, command=batch.command[first], start=jnp.asarray(from_start, float_type),
-                        pose_index=jnp.asarray(every), pose_weight=jnp.asarray(last, float_type),
-                        odometry_index=jnp.asarray(every), odometry_weight=jnp.asarray(last, float_type))
-        if batch.gyro_index is not None:
-            whole = replace(whole, gyro_index=jnp.asarray(every), gyro_weight=jnp.asarray(last, float_type))
         self._times = {"pose": (np.asarray(batch.pose_index), np.asarray(batch.pose_weight, float)),
                        "odometry": (np.asarray(batch.odometry_index), np.asarray(batch.odometry_weight, float))}
         if batch.gyro_index is not None:
             self._times["gyro"] = np.asarray(batch.gyro_index), np.asarray(batch.gyro_weight, float)
+        ends = {"index": sent(every), "weight": sent(last)}
+        read: dict[str, Any] = {f"{name}_{what}": one for name in self._times for what, one in ends.items()}
+        whole = replace(batch, command=sent(command[first]), start=sent(from_start), **read)
         kind = HostReplay if plant.host is not None and on_processor() else Replay
         self._replay = kind(plant, whole, set_values)
         self.paths = paths or PathReplay(plant, set_values, rows_of_call(self.courses))
@@ -88,7 +84,7 @@ class CourseReplay:
         times = pieces.begins(records, count) * step - pieces.OVERLAP
         speeds = np.stack([speeds_at(trial, times) for trial in self._trials])
         other = copy(self)
-        other._traced = self._replay.on(replace(batch, speeds=jnp.asarray(speeds, jnp.result_type(float))))
+        other._traced = self._replay.on(replace(batch, speeds=sent(speeds)))
         other.drives = count * self.courses
         return other
 
@@ -105,6 +101,11 @@ class CourseReplay:
         turned = paths[..., TURN] if self._replay.batch.gyro_index is not None else None
         path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)  # type: ignore[arg-type]
         return self._spread(path, motion=True)
+
+    def compile(self, parameters: int, trials: tuple[Trial, ...]) -> None:
+        """Begin to compile what a processor needs to replay drives as long as these trials by so many parameters."""
+        if not isinstance(self._replay, HostReplay):
+            self.paths.compile(parameters, make_batch(trials, self._dt)[0])
 
     def traced(self, values: jax.Array) -> Simulated:
         """As `simulate`, within a compiled function."""
@@ -185,6 +186,10 @@ class DifferenceReplay:
         """The same with long drives in pieces side by side (`sysid.replay.pieces`) where it is traced."""
         pieces = self.replay.in_pieces
         return self if pieces is self.replay else replace(self, replay=pieces)
+
+    def compile(self, trials: tuple[Trial, ...]) -> None:
+        """Begin to compile what replays of trials as long as these need on a processor."""
+        self.replay.compile(self.space.size, trials)
 
     def simulate(self, values: np.ndarray) -> Simulated:
         """As that of the replay."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -19,6 +18,7 @@ import numpy as np
 
 from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial
 from sysid.replay.arrays import quaternion_product
+from sysid.replay.compiled import Compiled
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.delays import delay_apart
 from sysid.replay.one_drive import (
@@ -97,16 +97,20 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     odometry_t, odometry, odometry_mask = padded([trial.odometry for trial in trials], 5)
     pose_index, pose_weight = _grid(pose_t, record, records)
     odometry_index, odometry_weight = _grid(odometry_t, record, records)
-    floats = partial(jnp.asarray, dtype=jnp.result_type(float))
-    batch = Batch(floats(command.reshape(len(trials), records, stride, 2)), floats(start), jnp.asarray(pose_index),
-                  floats(pose_weight), jnp.asarray(odometry_index), floats(odometry_weight),
+    batch = Batch(sent(command.reshape(len(trials), records, stride, 2)), sent(start), sent(pose_index),
+                  sent(pose_weight), sent(odometry_index), sent(odometry_weight),
                   warm_up=round(WARM_UP / dt) if start[:, 3:].any() else 0)
     if all(trial.gyro is None for trial in trials):
         return batch, Measured(pose, pose_mask, odometry, odometry_mask)
     gyro_t, gyro, gyro_mask = padded([trial.gyro for trial in trials], 1)
     gyro_index, gyro_weight = _grid(gyro_t, record, records)
-    batch = replace(batch, gyro_index=jnp.asarray(gyro_index), gyro_weight=floats(gyro_weight))
+    batch = replace(batch, gyro_index=sent(gyro_index), gyro_weight=sent(gyro_weight))
     return batch, Measured(pose, pose_mask, odometry, odometry_mask, gyro, gyro_mask, gyro_t)
+
+
+def sent(array: np.ndarray) -> jax.Array:
+    """A copy with JAX's usual precision on its device; `jnp.asarray` would compile a program for each shape."""
+    return jax.device_put(array.astype(jnp.result_type(float if array.dtype.kind == "f" else int)))
 
 
 def simulate(plant: Plant, params: Any, batch: Batch) -> Simulated:
@@ -229,14 +233,24 @@ class _Programs:
             commanded = Commanded(command, from_reference(params, start))
             return as_sensed(plant, params, commanded, path[: len(command) + 1], gyro)
 
-        self._begin = jax.jit(jax.vmap(begin, in_axes=(0, 0, 0, None)), static_argnums=3)
-        self._drive = jax.jit(jax.vmap(drive, in_axes=(0, 0, 0, None)))
-        self._finish = jax.jit(jax.vmap(finish, in_axes=(0, 0, 0, 0, None)), static_argnums=4)
+        self._begin = Compiled(jax.vmap(begin, in_axes=(0, 0, 0, None)), static=1)
+        self._drive = Compiled(jax.vmap(drive, in_axes=(0, 0, 0, None)))
+        self._finish = Compiled(jax.vmap(finish, in_axes=(0, 0, 0, 0, None)), static=1)
+        self._observe = jax.vmap(plant.observe)
 
-    def __call__(self, values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int, gyro: bool) -> jax.Array:
+    def compile(self, values: Any, command: Any, start: Any, warm_up: int, gyro: bool) -> None:
+        """Begin to compile all three, side by side, for arguments of these shapes."""
+        state, held = self._begin.shapes(values, command, start, warm_up)
+        seen = jax.eval_shape(self._observe, state)
+        path = jax.ShapeDtypeStruct((held.shape[0], held.shape[1] + 1, seen.shape[1]), seen.dtype)
+        self._drive.compile(values, state, held, jax.ShapeDtypeStruct((), jnp.int32))
+        self._finish.compile(values, path, command, start, gyro)
+        self._begin.compile(values, command, start, warm_up)
+
+    def __call__(self, values: np.ndarray, command: np.ndarray, start: np.ndarray, warm_up: int, gyro: bool) -> Any:
         """Paths (N, R + 1, C) of sets (N, P) and drives with commands (N, R, K, 2) from starts (N, 5)."""
         state, held = self._begin(values, command, start, warm_up)
-        path = self._drive(values, state, held, jnp.asarray(command.shape[1], jnp.int32))
+        path = self._drive(values, state, held, np.int32(command.shape[1]))
         return self._finish(values, path, command, start, gyro)
 
 
@@ -250,31 +264,42 @@ class PathReplay:
         def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int, gyro: bool) -> jax.Array:
             return path_of(plant, set_values(values), Commanded(command, start, warm_up), rows <= IN_ONE, gyro)
 
-        self.rows, self._compiled = rows, False
+        self.rows, self._begun = rows, set[Any]()
         self._run: Any = _Programs(plant, set_values, rows) if on_processor() else jax.jit(
             jax.vmap(one, in_axes=(0, 0, 0, None, None)), static_argnums=(3, 4))
+
+    def compile(self, parameters: int, batch: Batch) -> None:
+        """Begin to compile what sets of so many parameters need on a processor, for drives as long as the batch's."""
+        shapes = (parameters,), batch.command.shape[1:], batch.start.shape[1:]
+        warm_up, gyro = batch.warm_up, batch.gyro_index is not None
+        if (shapes, warm_up, gyro) not in self._begun and isinstance(self._run, _Programs):
+            self._begun.add((shapes, warm_up, gyro))
+            values, command, start = (jax.ShapeDtypeStruct((self.rows, *shape), jnp.result_type(float))
+                                      for shape in shapes)
+            self._run.compile(values, command, start, warm_up, gyro)
 
     def __call__(self, values: np.ndarray, batch: Batch, trials: np.ndarray) -> np.ndarray:
         """Paths (N, R + 1, 9) of sets (N, P), each on the trial of `batch` that trials (N,) names."""
         count = len(values)
         spare = -count % self.rows
-        values = np.concatenate([values, np.repeat(values[-1:], spare, axis=0)])
+        values = np.concatenate([values, np.repeat(values[-1:], spare, axis=0)]).astype(jnp.result_type(float))
         trials = np.concatenate([trials, np.repeat(trials[-1:], spare)])
-        command, start = jnp.asarray(batch.command), jnp.asarray(batch.start)  # commands are much larger than the rest
+        self.compile(values.shape[1], batch)
+        # Commands are much larger than the rest: an accelerator gets them once.
+        command, start = ((np if on_processor() else jnp).asarray(one) for one in (batch.command, batch.start))
 
         def part(first: int) -> jax.Array:
             chosen = trials[first : first + self.rows]
-            return self._run(jnp.asarray(values[first : first + self.rows], jnp.result_type(float)),
-                             command[chosen], start[chosen], batch.warm_up, batch.gyro_index is not None)
+            return self._run(values[first : first + self.rows], command[chosen], start[chosen], batch.warm_up,
+                             batch.gyro_index is not None)
 
         firsts = range(0, len(values), self.rows)
         if on_processor():
-            parts = on_all_cores(lambda first: np.asarray(part(first)), firsts, self._compiled)
+            parts = on_all_cores(lambda first: np.asarray(part(first)), firsts)
         else:  # it computes while rows are sent and fetched; most of the spare ones stay there
             begun = [part(first) for first in firsts]
             begun[-1] = begun[-1][: self.rows - spare // FETCHED * FETCHED]
             parts = [np.asarray(paths) for paths in begun]
-        self._compiled = True
         return np.concatenate(parts)[:count]
 
 

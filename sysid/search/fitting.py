@@ -21,7 +21,7 @@ from sysid.logs.log import of_file
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.logs.sources import refuse_recording
 from sysid.replay import models
-from sysid.replay.differences import make_replay
+from sysid.replay.differences import DifferenceReplay, make_replay
 from sysid.replay.model_files import load_model
 from sysid.replay.models import Model
 from sysid.replay.records import Plant
@@ -90,6 +90,9 @@ def fit_log(
         config = replace(config, elsewhere=False)
     space, objective = given.space, given.objective
     wanted = profiled(space, config)
+    if isinstance(objective.replay, DifferenceReplay):
+        for trials in (objective.trials, odometry_frames.at_frames((*log.training, *log.held_out), given.frame)):
+            objective.replay.compile(trials)  # `predict` replays all of them
     iterations = min(config.iterations, settings.QUICK_ITERATIONS) if config.quick else config.iterations
     stages = Stages(progress, 1 if config.method in settings.GLOBAL else 3 if config.method == "lm" else 4)
     scan, coarse, points = _first_points(log, given, config, stages)

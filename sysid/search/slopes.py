@@ -45,7 +45,7 @@ def average_slopes(
     points = np.clip(objective.space.moved(np.tile(u, (len(moves), 1)), moves), 0.0, 1.0)
     for first in range(0, len(moves), count):
         part = slice(first, first + count)
-        slopes += np.einsum("pn,nbk->bkp", weights[:, part], objective.residuals(points[part]))
+        slopes += np.tensordot(objective.residuals(points[part]), weights[:, part], (0, 1))
     return residual, slopes
 
 
@@ -77,7 +77,8 @@ def likely(jacobian: np.ndarray, variance: float) -> np.ndarray:
 
 def _products(jacobian: np.ndarray) -> np.ndarray:
     """J^T J (P, P) of derivatives (B, K, P)."""
-    return np.asarray(np.einsum("bkp,bkq->pq", jacobian, jacobian))
+    rows = jacobian.reshape(-1, jacobian.shape[-1])
+    return np.asarray(rows.T @ rows)
 
 
 def likely_by(hessian: np.ndarray, variance: float) -> np.ndarray:

@@ -10,6 +10,7 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
+from sysid.replay.compiled import Compiled
 from sysid.replay.differences import FEW, MANY, VECTOR, CourseReplay, make_courses, rows_of_call
 from sysid.replay.models import with_effects
 from sysid.replay.rollout import PathReplay, Replay, make_batch
@@ -146,3 +147,44 @@ def test_drives_of_any_length_share_the_program_of_the_physics(unicycle_log):
     part = paths(values, dataclasses.replace(batch, command=batch.command[:, :40]), first)
     assert len(traced) == count
     np.testing.assert_allclose(part, whole[:, :41], atol=1e-6)
+
+
+def test_what_is_compiled_ahead_is_not_compiled_again(unicycle_log, monkeypatch):
+    trials, plant = unicycle_log.training, unicycle_plant()
+    courses = CourseReplay(plant, trials, lambda values: values)
+    begun: list[str] = []
+    build = Compiled._compile
+    monkeypatch.setattr(Compiled, "_compile", lambda one, *given: begun.append("") or build(one, *given))
+    courses.compile(len(TRUTH), trials)
+    courses.simulate(TRUTH[None])
+    assert len(begun) == 3  # the begin of a drive, its steps, and what sensors make of it
+    batch, _ = make_batch(trials, plant.dt)
+    shorter = dataclasses.replace(batch, command=batch.command[:, :40])
+    courses.paths.compile(len(TRUTH), shorter)
+    courses.paths(TRUTH[None], shorter, np.array([0]))
+    assert len(begun) == 5  # the steps are those of any length
+
+
+def test_a_function_is_compiled_once_for_each_shape_and_each_static_argument():
+    traced = []
+
+    def scaled(x, factor):
+        traced.append((x.shape, factor))
+        return factor * x
+
+    function = Compiled(scaled, static=1)
+    for size, factor in ((3, 2), (3, 2), (4, 2), (3, 5)):
+        np.testing.assert_array_equal(function(np.ones(size, np.float32), factor), factor * np.ones(size))
+    assert sorted(traced) == [((3,), 2), ((3,), 5), ((4,), 2)]
+    assert function.shapes(np.ones(3, np.float32), 2).shape == (3,)
+
+
+def test_what_fails_while_it_is_compiled_fails_where_it_is_needed():
+    def refused(x):
+        raise ValueError("no such thing")
+
+    function = Compiled(refused)
+    program = function.compile(np.ones(2))
+    with pytest.raises(ValueError, match="no such thing"):
+        function(np.ones(2))
+    assert isinstance(program.exception(), ValueError)

@@ -1,0 +1,52 @@
+"""Functions that are compiled ahead, in threads: XLA works on several programs at a time, beside everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from threading import Lock
+from typing import Any
+
+import jax
+
+_COMPILERS = ThreadPoolExecutor(4)
+
+
+class Compiled:
+    """A function of arrays with one program for each of their shapes; the last arguments may be static."""
+
+    def __init__(self, function: Callable[..., Any], static: int = 0):
+        """Take the function, and how many of its last arguments are static."""
+        self._function, self._static = function, static
+        self._programs: dict[Any, Future[Any]] = {}
+        self._lock = Lock()
+
+    def shapes(self, *args: Any) -> Any:
+        """What it gives for such arguments, as shapes."""
+        arrays, static = self._apart(args)
+        return jax.eval_shape(lambda *given: self._function(*given, *static), *arrays)
+
+    def compile(self, *args: Any) -> Future[Any]:
+        """The program for arrays like these, or their shapes; it is compiled once, in a thread of its own."""
+        arrays, static = self._apart(args)
+        leaves, structure = jax.tree.flatten(arrays)
+        key = structure, static, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        with self._lock:
+            if key not in self._programs:
+                shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), arrays)
+                self._programs[key] = _COMPILERS.submit(self._compile, shapes, static)
+            return self._programs[key]
+
+    def __call__(self, *args: Any) -> Any:
+        """What the function gives, as soon as it is compiled."""
+        return self.compile(*args).result()(*self._apart(args)[0])
+
+    def _compile(self, shapes: tuple[Any, ...], static: tuple[Any, ...]) -> Any:
+        count = len(shapes)
+        function = jax.jit(self._function, static_argnums=tuple(range(count, count + len(static))))
+        return function.lower(*shapes, *static).compile()
+
+    def _apart(self, args: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Arrays, and what is static."""
+        count = len(args) - self._static
+        return args[:count], args[count:]
