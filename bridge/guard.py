@@ -28,7 +28,8 @@ SIMULATED = 10.0
 other, and nobody sits on the vehicle."""
 WATCH_PERIOD = 0.01
 LATE = 0.05
-"""A watch that comes this much [s] after the one before has not yet read what arrived meanwhile, and judges nothing."""
+"""A watch that comes this much [s] after the one before has not yet read what arrived meanwhile. It judges by what had
+arrived at the one before, so a guard that always comes late still stops a dead node."""
 BEAT_PERIOD = 0.05
 REPEATS = 10
 """Zeros sent per stop, 50 ms apart."""
@@ -76,16 +77,17 @@ class Watchdog:
 
     def tick(self, now: float) -> bool:
         """Return whether to publish a zero now."""
-        late, self._ticked = now - self._ticked > LATE, now
+        read = self._ticked if now - self._ticked > LATE else now  # until when all that arrived has been read
+        self._ticked = now
         for session, alive in list(self._driving.items()):
-            if now - alive > self.silence and not late:
+            if read - alive > self.silence:
                 del self._driving[session]
                 self.abandoned = True
                 if not self._stands:
                     self._left, self._next = REPEATS, now
                     self.stops += 1
         for session, heard in list(self.heard.items()):
-            if now - heard > FORGET:
+            if read - heard > FORGET:
                 del self.heard[session]
                 self.abandoned = self.abandoned or not self.heard
         if self._left and now >= self._next:

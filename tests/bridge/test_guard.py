@@ -71,7 +71,7 @@ def test_guard_forgets_a_node_that_stays_silent():
     guard.heartbeat(0.0, "a", False)
     guard.tick(1.0)
     assert "a" in guard.heard
-    guard.tick(3.0)
+    guard.tick(3.0), guard.tick(3.01)  # the first of them comes late itself, and has not read yet
     assert "a" not in guard.heard
 
 
@@ -144,6 +144,15 @@ def test_a_guard_that_comes_late_itself_first_reads_what_has_arrived():
     assert not watchdog.tick(1.01) and watchdog.stops == 0
     assert not watchdog.tick(1.04) and not watchdog.tick(1.08) and not watchdog.tick(1.12) and not watchdog.tick(1.15)
     assert watchdog.tick(1.16) and watchdog.stops == 1
+
+
+def test_a_guard_that_always_comes_late_still_stops_a_dead_node():
+    watchdog = Watchdog()
+    for tick in range(20):  # each 80 ms: it shares its processor with others
+        watchdog.heartbeat(0.08 * tick, "a", driving=True)
+        watchdog.command(True)
+        assert not watchdog.tick(0.08 * tick)
+    assert not watchdog.stops and any(watchdog.tick(0.08 * tick) for tick in range(20, 25)) and watchdog.stops == 1
 
 
 class Executor:
