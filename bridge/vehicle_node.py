@@ -215,6 +215,8 @@ class VehicleNode:
         if not self.supervisor.arm():
             why = ", ".join(self.supervisor.holds) or self.supervisor.reason
             self.node.get_logger().error(f"not armed: {why} still holds")
+        elif self._lock is not None:
+            self._lock.follow(self.now(), self.supervisor)  # now: a frame may come before the next watch
 
     def _on_beat(self) -> None:
         self._beat(self.supervisor.may_drive)
