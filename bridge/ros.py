@@ -156,15 +156,16 @@ def is_reliable(policy: Any) -> bool:
 
 
 def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
-    """Subscribe to a state such as an emergency stop, whatever durability its publisher offers.
+    """Subscribe to a state such as an emergency stop, whatever quality of service its publisher offers.
 
-    A volatile reader hears all publishers but gets no earlier value; a transient-local one gets the value that was
-    latched before the bridge started, but hears latching publishers only. Each value may come twice.
+    No single reader does. A best-effort one hears all publishers, but may lose a message and gets no earlier value. A
+    reliable one loses nothing. A transient-local one gets the value that was latched before the bridge started. Each
+    value may come three times.
     """
-    node.create_subscription(kind, topic, callback, reliable(10))
-    # that a volatile publisher does not fit the second reader is no fault: the first one hears it
-    node.create_subscription(kind, topic, callback, latched(),
-                             event_callbacks=subscription_events(incompatible_qos=lambda _: None))
+    for profile in (best_effort(10), reliable(10), latched()):
+        # that a publisher does not fit one of the readers is no fault: the first one hears it
+        node.create_subscription(kind, topic, callback, profile,
+                                 event_callbacks=subscription_events(incompatible_qos=lambda _: None))
 
 
 def diagnostics(node: Any) -> Callable[[bool, str, dict[str, Any]], None]:
