@@ -30,6 +30,9 @@ WATCH_PERIOD = 0.01
 LOOK_PERIOD = 0.2
 """Seconds between two looks at the graph."""
 STATUS_PERIOD = 1.0
+OVERDUE = 2.0
+"""Seconds after which graph and status get their turn although it delays a command: a policy whose steps come one upon
+the other leaves no time, and yet it needs a guard, and its operator a status."""
 CLOCK_STEP = 0.1
 """Difference [s] of wall and steady clock between two watches that counts as a clock jump."""
 NO_GUARD, NO_BASE, COMMANDERS = "no guard", "no base listens", "another node publishes commands"
@@ -177,8 +180,9 @@ class VehicleNode:
         if self._ear.foreign_zero():
             self.supervisor.foreign_command(now)
         self._publish(self.decider.on_tick(now))
-        if self.has_time(now):
-            self._keep_house(time.monotonic())
+        steady = time.monotonic()
+        if self.has_time(now) or steady - min(self._looked, self._said) > OVERDUE:
+            self._keep_house(steady)
 
     def _keep_house(self, now: float) -> None:
         """Look at the graph and report, where it is time: by the steady clock, since a graph does not wait."""

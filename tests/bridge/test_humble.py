@@ -109,6 +109,19 @@ for i in range(6):
         node.fire()
 print(bridge.supervisor.state.value, bridge.supervisor.holds, node.publishers["/whill/controller/cmd_vel"].sent)
 """
+FAST = START + """
+vehicle_node.LOOK_PERIOD = vehicle_node.STATUS_PERIOD = 0.02
+vehicle_node.OVERDUE = 0.05
+statuses, end = node.publishers["/bridge/status"].sent, time.monotonic() + 30
+before = len(statuses)
+while len(statuses) < before + 3 and time.monotonic() < end:
+    node.clock.nanoseconds += 10**7
+    image = humble_stub.Image(height=8, width=8, encoding="rgb8", step=24, data=bytes([len(statuses) % 9]) * 192)
+    image.header.stamp = node.clock.now().to_msg()
+    node.deliver("/" + options.image_topic, image)
+    node.fire()  # at once: there is no pause between two steps
+print(len(statuses) - before)
+"""
 
 CHAIR = """
 import sys
@@ -169,3 +182,7 @@ def test_joystick_is_locked_while_the_vehicle_is_armed_and_unlocked_when_its_rid
 def test_frame_that_comes_right_after_arming_does_not_drive_before_the_joystick_is_locked(tmp_path):
     said = run(ARM, tmp_path, "--image-topic", "camera", "--require-arm", "--resume", "arm", "--joystick-lock")
     assert said.strip() == 'standing ["the chair\'s joystick is not locked"] []'
+
+
+def test_policy_whose_steps_come_one_upon_the_other_still_reports_its_status(tmp_path):
+    assert run(FAST, tmp_path, "--image-topic", "camera").strip() == "3"
