@@ -1,6 +1,7 @@
 """One trial of a driving-log dataset, written row by row while it is driven."""
 
 import contextlib
+import itertools
 import math
 import os
 import re
@@ -150,7 +151,8 @@ class TrialWriter:
         """
         aside = self.folder.parent.with_name("aborted")
         aside.mkdir(exist_ok=True)
-        self.folder = aside / f"{self.folder.name}.{sum(1 for _ in aside.iterdir()) + 1}"
+        names = (f"{self.folder.name}.{k}" for k in itertools.count(1))
+        self.folder = aside / next(name for name in names if not (aside / name).exists())
         return self.close()
 
     def _is_early(self, stream: str, t: float) -> bool:

@@ -4,6 +4,7 @@ import argparse
 import csv
 import math
 import os
+import shutil
 import tomllib
 
 import pytest
@@ -129,6 +130,17 @@ def test_values_that_are_not_finite_are_left_out(tmp_path):
     writer.command(0.0, math.nan, 0.0)
     writer.command(0.1, 0.2, 0.0)
     assert len(read(writer.close() / "command.csv")) == 1
+
+
+def test_recordings_that_are_put_aside_never_replace_one_another(tmp_path):
+    def aside():
+        writer = TrialWriter(tmp_path, "circle_1")
+        writer.odometry(1.0, (0, 0, 0), (0, 0))
+        return writer.put_aside()
+
+    first, second = aside(), aside()
+    shutil.rmtree(first)
+    assert len({second, aside(), aside()}) == 3 and second.exists()
 
 
 def test_recording_never_replaces_a_trial(tmp_path):
