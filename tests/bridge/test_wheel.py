@@ -108,3 +108,26 @@ def test_launch_file_names_programs_of_the_package_and_topics_of_the_node(name):
     text = (ROOT / "bridge" / "launch" / f"{name}.launch.py").read_text(encoding="utf-8")
     compile(text, name, "exec")
     assert 'package="whill_bridge", executable="bridge_drive"' in text and f'"{ros.COMMAND_TOPIC}"' in text
+
+
+def test_service_starts_again_after_a_crash_and_writes_where_its_user_may():
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str
+    unit.read(ROOT / "bridge" / "systemd" / "whill-bridge.service")
+    service = unit["Service"]
+    assert service["Restart"] == "always"  # `ros2 launch` ends with 0 when a node of it has died
+    assert not [value for value in service.values() if "%h" in value]  # the home of root, whatever User says
+
+
+def test_every_command_of_the_package_is_a_program_of_both_wheels():
+    import tomllib
+
+    from bridge.__main__ import COMMANDS
+
+    config = configparser.ConfigParser()
+    config.read(ROOT / "bridge" / "setup.cfg")
+    own = config["options.entry_points"]["console_scripts"]
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
+    for name in COMMANDS:
+        assert f"bridge_{name} = bridge.{name}:main" in own.splitlines()
+        assert scripts[f"bridge-{name.replace('_', '-')}"] == f"bridge.{name}:main"
