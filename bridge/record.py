@@ -76,7 +76,7 @@ def toml_text(text: str) -> str:
 
 
 class StampedListener(CommandListener):
-    """Hears commands with their own time, and whole."""
+    """Hears commands with their own time, and whole; best effort, so that no recorder ever holds up a command."""
 
     def __init__(self, node: Any, topic: str, on_message: Callable[[Any, float, float, float], None]) -> None:
         """Listen in the type that the base hears.
@@ -84,6 +84,8 @@ class StampedListener(CommandListener):
         `on_message` gets the message, its stamp [s] (0 where it has none), v [m/s] and omega [rad/s].
         """
         self._on_message = on_message
+        self.lost = 0
+        """Commands that the middleware reports as lost."""
         super().__init__(node, topic, "auto", lambda v, omega: None)
 
     def _open(self, kind: str) -> None:
@@ -95,8 +97,12 @@ class StampedListener(CommandListener):
                 planar, stamp = message.twist, ros.stamp_seconds(message.header.stamp)
             self._on_message(message, stamp, planar.linear.x, planar.angular.z)
 
+        def count(event: Any) -> None:
+            self.lost += event.total_count_change
+
         self.kind = kind
-        ros.subscribe_own(self.node, getattr(msg, kind), self.name, heard, ros.best_effort(DEPTH))
+        topic = ros.Topic(getattr(msg, kind), self.name, ros.best_effort(DEPTH))
+        ros.subscribe_counting_losses(self.node, topic, heard, count, use_default_callbacks=False)
 
 
 class RecordNode:
@@ -134,7 +140,7 @@ class RecordNode:
 
     def lost(self) -> dict[str, int]:
         """Return how many messages of each topic the middleware lost, where it lost any."""
-        heard = [*self.streams, *(self._whole or {}).values()]
+        heard = [self._commands, *self.streams, *(self._whole or {}).values()]
         return {stream.name: stream.lost for stream in heard if stream.lost}
 
     def _look(self) -> None:

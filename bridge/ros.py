@@ -82,11 +82,11 @@ def reliable(depth: int = 1) -> Any:
     return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 
 
-def latched() -> Any:
-    """A state that late joiners must get: reliable, and the last value is kept for them."""
+def latched(depth: int = 1) -> Any:
+    """A state that late joiners must get: reliable, and the last values are kept for them."""
     from rclpy.qos import DurabilityPolicy
 
-    profile = reliable()
+    profile = reliable(depth)
     profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
     return profile
 
@@ -153,6 +153,13 @@ def is_reliable(policy: Any) -> bool:
     from rclpy.qos import ReliabilityPolicy
 
     return bool(policy == ReliabilityPolicy.RELIABLE)
+
+
+def is_latched(policy: Any) -> bool:
+    """Return whether a publisher's durability, as the graph gives it, keeps values for late joiners."""
+    from rclpy.qos import DurabilityPolicy
+
+    return bool(policy == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
