@@ -5,9 +5,13 @@ command line itself win.
 """
 
 import re
+import sys
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
+
+from bridge import ros
+from bridge.exits import Exit
 
 LARGEST = 100_000
 """Bytes of a parameter file; those of the bridge have 2 kB."""
@@ -15,6 +19,25 @@ MOST_TABLES = 1000
 """Of a parameter file; aliases can make endlessly many of a few bytes."""
 OF_ROS = ("use_sim_time", "start_type_description_service")
 """Parameters that every ROS node has; the node itself reads them."""
+
+
+def command_line(arguments: list[str] | None, program: str, positional: str = "") -> tuple[list[str], list[str]]:
+    """Return the words of a command line, ROS parameters of its node among them, and what follows `--ros-args`.
+
+    Args:
+        arguments: of `main`; None: those of the process.
+        program: such as bridge.guard, whose node is bridge_guard.
+        positional: as of `as_options`.
+
+    Raises:
+        SystemExit: a parameter file cannot be read, or has nothing for this node.
+    """
+    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return with_options(ros_arguments, program.replace(".", "_"), positional, own), ros_arguments
+    except ValueError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        raise SystemExit(int(Exit.FAULT)) from None
 
 
 def with_options(ros_arguments: list[str], node: str, positional: str, own: list[str]) -> list[str]:
@@ -46,7 +69,7 @@ def as_options(ros_arguments: list[str], node: str, positional: str = "", given:
         elif flag in ("-p", "--param") and ":=" in argument:
             left, _, text = argument.partition(":=")
             target, _, name = left.rpartition(":")
-            if not target or _is_for(target, full):
+            if name not in OF_ROS and (not target or _is_for(target, full)):
                 values[name] = _yaml(text)
     words: list[str] = []
     for name, value in values.items():

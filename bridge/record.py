@@ -25,6 +25,7 @@ from bridge.commands import CommandListener
 from bridge.exits import Exit, OptionError, refusal
 from bridge.mcap_file import mend
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
+from bridge.parameters import command_line
 from bridge.split_writer import SplitWriter
 from bridge.streams import DEPTH, Stream
 from bridge.trial_writer import MCAP, PARTIAL, TrialWriter
@@ -365,7 +366,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Returns an `Exit`: FAULT where nothing can be written, also on the way, SHORT without odometry.
     """
-    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, ros_arguments = command_line(arguments, "bridge.record")
     options = parse_arguments(own)
     if options.recover:
         return main_recover(options.dataset)

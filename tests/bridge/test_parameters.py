@@ -1,9 +1,11 @@
 """ROS parameters become options of the command line, which wins over them."""
 
+import importlib
+
 import pytest
 
 from bridge.drive import parse_arguments
-from bridge.parameters import with_options
+from bridge.parameters import command_line, with_options
 
 pytest.importorskip("yaml")
 pytestmark = pytest.mark.quick
@@ -86,6 +88,32 @@ def test_renamed_node_has_the_section_of_its_name_and_parameters_of_others_are_l
            "-p", "other:base:=generic", "-p", "chair_1:blind:=stop"]
     parsed = options(ros, "runs/a")
     assert (parsed.e_stop, parsed.base, parsed.blind) == ("watch", "whill", "stop")
+
+
+@pytest.mark.parametrize("name, parameter, option, value", [
+    ("guard", "command_topic:=base/cmd_vel", "command_topic", "base/cmd_vel"),
+    ("chair", "wheel_radius:=0.13", "wheel_radius", 0.13),
+    ("chair_joy", "full:=[0.5, 0.4, 0.8]", "full", [0.5, 0.4, 0.8]),
+    ("record", "odometry_topic:=odom", "odometry_topic", "odom"),
+    ("simulate", "seed:=4", "seed", 4),
+])
+def test_each_command_takes_its_parameters(name, parameter, option, value):
+    command = importlib.import_module(f"bridge.{name}")
+    words = ["logs", "one"] if name == "record" else []
+    own, _ = command_line([*words, "--ros-args", "-r", "__ns:=/left", "-p", parameter, "-p", "use_sim_time:=false"],
+                          f"bridge.{name}")
+    assert getattr(command.parse_arguments(own), option) == value
+    with pytest.raises(SystemExit):  # and none in silence
+        command.main([*words, "--ros-args", "-p", "no_such_option:=1"])
+
+
+def test_command_without_a_section_in_its_parameter_file_says_so(tmp_path, capsys):
+    from bridge.chair import main
+
+    (tmp_path / "one.yaml").write_text("bridge_drive: {ros__parameters: {e_stop: watch}}")
+    with pytest.raises(SystemExit) as ended:
+        main(["--ros-args", "--params-file", str(tmp_path / "one.yaml")])
+    assert ended.value.code == 1 and "no section for the node /bridge_chair" in capsys.readouterr().err
 
 
 def test_missing_parameter_file_is_named(tmp_path):
