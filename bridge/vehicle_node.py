@@ -198,7 +198,8 @@ class VehicleNode:
 
     def _on_guard(self, message: Any) -> None:
         now = self.now()
-        self.guard.heard(now, message.data)
+        if not self.guard.heard(now, message.data):
+            return
         self._ear.guard_reports(self.guard.zeros)
         if self.guard.stops > self._guard_stops and self._lock is not None:
             self._lock.forget()  # the guard has unlocked it

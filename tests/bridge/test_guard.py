@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 
 import pytest
 
@@ -93,8 +94,8 @@ def test_bridge_trusts_only_a_guard_that_hears_it_and_reaches_its_base(change, p
 def test_guard_of_an_earlier_node_on_the_same_topics_does_not_disturb():
     link = GuardLink("me", "/cmd_vel", None)
     for i in range(20):
-        link.heard(1 + i / 20, json.dumps(GOOD))
-        link.heard(1 + i / 20, json.dumps({**GOOD, "hears": ["dead"], "zeros": 10, "stops": 1}))
+        assert link.heard(1 + i / 20, json.dumps(GOOD))
+        assert not link.heard(1 + i / 20, json.dumps({**GOOD, "hears": ["dead"], "zeros": 10, "stops": 1}))
         assert link.problem(1 + i / 20) == "" and link.stops == 0
     link.heard(3.0, json.dumps({**GOOD, "hears": ["dead"]}))
     assert "does not hear" in link.problem(3.0)
@@ -126,6 +127,27 @@ def test_guard_that_ended_is_started_again_after_a_pause():
     link.heard(2.05, json.dumps(GOOD))
     link.keep(2.1)
     assert len(started) == 2 and link.problem(2.11) == "no guard is running"  # whatever the dead one said
+
+
+def test_guard_that_does_not_end_when_it_is_asked_is_killed():
+    class Stopped(Process):
+        told = ()
+
+        def terminate(self):
+            self.told = (*self.told, "terminate")
+
+        def kill(self):
+            self.told, self.returncode = (*self.told, "kill"), -9
+
+        def wait(self, seconds=None):
+            if self.returncode is None:
+                raise subprocess.TimeoutExpired("guard", seconds)
+
+    process = Stopped()
+    link = GuardLink("me", "/cmd_vel", lambda: process)
+    link.keep(0.0)
+    link.close()
+    assert process.told == ("terminate", "kill") and process.poll() == -9
 
 
 @pytest.mark.parametrize("text", ["", "nonsense", "[]", "{}", '{"session": 3, "driving": true}', '{"session": "a"}'])
