@@ -355,6 +355,11 @@ def main_recover(dataset: Path) -> int:
         return refusal(error)
     for folder in found:
         print(f"bridge.record: {folder}: recovered", file=sys.stderr)
+    for left in sorted(dataset.glob(".*.partial-*")):
+        if match := PARTIAL.fullmatch(left.name):
+            print(f"bridge.record: {left}: left alone, because a process {match['process']} runs. End it, or where it "
+                  "is another program, rename the folder", file=sys.stderr)
+            return Exit.DONE
     if not found:
         print(f"bridge.record: {dataset}: no recording of a killed recorder is there", file=sys.stderr)
     return Exit.DONE

@@ -36,7 +36,11 @@ class TrialWriter:
         self.folder = self.check(dataset, trial)
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self._partial = Path(dataset) / f".{trial}.partial-{os.getpid()}"
-        self._partial.mkdir()
+        try:
+            self._partial.mkdir()
+        except FileExistsError:
+            raise OptionError(f"{self._partial}: is a recording that was killed. Make a trial of it with --recover, or "
+                              "remove it.") from None
         self._files: dict[str, IO[str]] = {}
         self._mcap: McapWriter | None = None
         self._origin: float | None = None

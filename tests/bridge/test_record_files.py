@@ -219,6 +219,16 @@ def test_recording_of_a_killed_recorder_is_recovered_without_its_torn_row(tmp_pa
     assert main(["--recover", str(tmp_path)]) == Exit.FAULT and "exists already" in capsys.readouterr().err
 
 
+def test_recording_that_may_still_be_written_is_left_alone_and_named(tmp_path, capsys):
+    TrialWriter(tmp_path, "killed_1")
+    assert main(["--recover", str(tmp_path)]) == 0
+    said = capsys.readouterr().err
+    assert f"partial-{os.getpid()}: left alone, because a process {os.getpid()} runs" in said
+    assert "no recording" not in said
+    with pytest.raises(ValueError, match=r"is a recording that was killed. Make a trial of it with --recover"):
+        TrialWriter(tmp_path, "killed_1")  # by a process of the same number, as in a container
+
+
 def test_yaw_rate_of_an_imu_is_kept_with_its_stamps(tmp_path):
     writer = TrialWriter(tmp_path, "a")
     writer.odometry(5.0, (0.0, 0.0, 0.0), (0.0, 0.0))
