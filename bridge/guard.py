@@ -155,9 +155,9 @@ class GuardNode:
 
     def _on_look(self) -> None:
         """Find out whether a zero would reach the base."""
-        before = self._ready
-        listeners = [end for end in self.topic.listeners() if end.type.endswith("/" + self.topic.kind)]
-        self._ready = self.topic.look() and bool(listeners) and self.topic.matched_listeners() >= len(listeners)
+        before, topic = self._ready, self.topic
+        there = topic.look() and any(map(topic.hears_us, topic.listeners()))
+        self._ready = there and (before or topic.reaches_all())  # a further reader does not end a drive
         if self._ready and not before:
             self.node.get_logger().info(f"guarding {self.topic.name} ({self.topic.kind})")
 

@@ -42,6 +42,8 @@ DRIVE_NAME = "bridge_drive"
 GUARD_NAME = "bridge_guard"
 RECORD_NAME = "bridge_record"
 MANOEUVRE_NAME = "bridge_manoeuvre"
+ENDLESS = 10**18
+"""Nanoseconds from which a deadline is none: DDS has 2^63 - 1 for it."""
 PROFILE = Path(__file__).with_name("fastdds.xml")
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -153,6 +155,15 @@ def is_reliable(policy: Any) -> bool:
     from rclpy.qos import ReliabilityPolicy
 
     return bool(policy == ReliabilityPolicy.RELIABLE)
+
+
+def hears_commands(requested: Any) -> bool:
+    """Return whether a subscriber's quality of service, as the graph gives it, lets it hear `reliable` commands.
+
+    They are not kept for late joiners, and promise no deadline. `qos_check_compatible` of rclpy takes the endless
+    deadline of the graph for one.
+    """
+    return not is_latched(requested.durability) and not 0 < requested.deadline.nanoseconds < ENDLESS
 
 
 def is_latched(policy: Any) -> bool:

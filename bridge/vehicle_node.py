@@ -237,8 +237,7 @@ class VehicleNode:
         self.guard.keep(now)
         self.commands.look()
         self._listeners = self.commands.listeners()
-        fitting = [end for end in self._listeners if end.type.endswith("/" + self.commands.kind)]
-        self.supervisor.block(NO_BASE, not (self.commands.kind and fitting))
+        self.supervisor.block(NO_BASE, not any(map(self.commands.hears_us, self._listeners)))
         self._others.look(now, self.commands.commanders())
         self._commanders = self._others.names(now)
         alone = not self.options.allow_other_commanders

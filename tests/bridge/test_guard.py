@@ -4,11 +4,13 @@ import json
 import os
 import signal
 import subprocess
+import types
 
 import pytest
 
 from bridge import ros
-from bridge.guard import GuardLink, Watchdog, read_beat
+from bridge.commands import CommandTopic, Endpoint
+from bridge.guard import GuardLink, GuardNode, Watchdog, read_beat
 
 pytestmark = pytest.mark.quick
 
@@ -74,6 +76,23 @@ def test_guard_forgets_a_node_that_stays_silent():
     assert "a" in guard.heard
     guard.tick(3.0), guard.tick(3.01)  # the first of them comes late itself, and has not read yet
     assert "a" not in guard.heard
+
+
+@pytest.mark.parametrize("matched, ready", [(2, False), (3, True)])
+def test_guard_is_ready_when_every_reader_is_matched_the_bases_among_them(matched, ready, monkeypatch):
+    node = types.SimpleNamespace(get_logger=lambda: types.SimpleNamespace(info=lambda text: None))
+    guard = GuardNode.__new__(GuardNode)
+    names = ("bridge_drive", "bridge_guard", "base")  # the node's and the guard's own ears are matched first
+    guard.node, guard._ready, topic = node, False, CommandTopic.__new__(CommandTopic)
+    topic.name, topic.kind, topic._known = "/cmd_vel", "Twist", ["/bridge_drive", "/bridge_guard"]
+    topic.publisher = types.SimpleNamespace(get_subscription_count=lambda: matched)
+    monkeypatch.setattr(topic, "readers", lambda: [Endpoint(f"/{name}", "geometry_msgs/msg/Twist") for name in names])
+    guard.topic = topic
+    guard._on_look()
+    assert guard._ready == ready
+    matched = 2  # a reader that comes to a guard that is ready ends nothing
+    guard._on_look()
+    assert guard._ready == ready
 
 
 GOOD = {"topic": "/cmd_vel", "type": "Twist", "ready": True, "zeros": 0, "stops": 0, "hears": ["me"]}
