@@ -141,7 +141,7 @@ class RecordNode:
 
     def lost(self) -> dict[str, int]:
         """Return how many messages of each topic the middleware lost, where it lost any."""
-        heard = [self._commands, *self.streams, *(self._whole or {}).values()]
+        heard: list[StampedListener | Stream] = [self._commands, *self.streams, *(self._whole or {}).values()]
         return {stream.name: stream.lost for stream in heard if stream.lost}
 
     def _look(self) -> None:
