@@ -15,6 +15,7 @@ from typing import Any
 from bridge import ros
 from bridge.exits import Exit
 from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
+from bridge.parameters import command_line
 from bridge.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
 
 SLOW = 0.15
@@ -65,7 +66,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Publish until SIGTERM or Ctrl-C."""
-    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, ros_arguments = command_line(arguments, "bridge.chair")
     options = parse_arguments(own)
     with ros.node_session("bridge_chair", ros_arguments) as node:
         chair = ChairNode(node, options)

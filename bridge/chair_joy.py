@@ -19,6 +19,7 @@ from typing import Any
 from bridge import ros
 from bridge.exits import Exit
 from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
+from bridge.parameters import command_line
 from bridge.whill import COMMAND_EXPIRY
 
 JOY_TOPIC = "whill/controller/joy"
@@ -115,7 +116,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Translate until SIGTERM or Ctrl-C, and leave the chair standing."""
-    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, ros_arguments = command_line(arguments, "bridge.chair_joy")
     options = parse_arguments(own)
     with ros.node_session("bridge_chair_joy", ros_arguments) as node:
         joy = JoyNode(node, options)

@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bridge import ros
@@ -112,6 +112,8 @@ class Endpoint:
     """Full name of its node."""
     type: str
     """Message type, such as geometry_msgs/msg/Twist."""
+    hears: bool = True
+    """Of a subscriber to commands: whether its quality of service fits ours."""
 
 
 def endpoints(infos: list[Any]) -> list[Endpoint]:
@@ -164,10 +166,19 @@ class CommandListener:
         if kind != "auto":
             self._open(kind)
 
+    def readers(self) -> list[Endpoint]:
+        """Return all who listen to commands, the bridge's own nodes too."""
+        infos = self.node.get_subscriptions_info_by_topic(self.name)
+        return [replace(endpoint, hears=ros.hears_commands(info.qos_profile))
+                for endpoint, info in zip(endpoints(infos), infos, strict=True)]
+
     def listeners(self) -> list[Endpoint]:
         """Return who listens to commands, without the bridge's own nodes and those whose name is not known yet."""
-        found = endpoints(self.node.get_subscriptions_info_by_topic(self.name))
-        return [endpoint for endpoint in without(found, *self._known) if UNKNOWN not in endpoint.node]
+        return [endpoint for endpoint in without(self.readers(), *self._known) if UNKNOWN not in endpoint.node]
+
+    def hears_us(self, endpoint: Endpoint) -> bool:
+        """Return whether a listener gets the commands of this topic, by its type and its quality of service."""
+        return bool(self.kind) and endpoint.type.endswith("/" + self.kind) and endpoint.hears
 
     def commanders(self) -> list[str]:
         """Return the names of all other nodes that publish commands; one guard beside us is not among them.
@@ -228,9 +239,10 @@ class CommandTopic(CommandListener):
             time.sleep(interval)
         self.publisher.wait_for_all_acked(Duration(seconds=0.5))
 
-    def matched_listeners(self) -> int:
-        """Return how many readers of other nodes get our commands, as far as the transport has matched them."""
-        return self.publisher.get_subscription_count() - 1 if self.publisher is not None else 0
+    def reaches_all(self) -> bool:
+        """Return whether the transport has matched every reader that hears us and that the graph knows."""
+        expected = sum(map(self.hears_us, self.readers()))  # the bridge's own ones are matched too
+        return self.publisher is not None and self.publisher.get_subscription_count() >= expected
 
     def _witnesses(self) -> list[Endpoint]:
         return self.listeners()

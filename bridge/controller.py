@@ -63,6 +63,8 @@ class Controller:
         """Size of the last camera message."""
         self.digest = 0
         """Hash of the last usable image."""
+        self.stepped = -np.inf
+        """Steady time of the last step that a frame made [s], driving or not."""
         self._clock = clock
         self._caution = caution
         self._pace_by_stamp = pace_by_stamp
@@ -142,7 +144,7 @@ class Controller:
 
     def _step(self, now: float, value: np.ndarray) -> Command | None:
         """Let the policy act on what its sensors show, where it may drive."""
-        supervisor, self._waiting = self.supervisor, None
+        supervisor, self._waiting, self.stepped = self.supervisor, None, now
         if supervisor.take_reset():
             self.policy.reset()
             self.senses.begin()

@@ -30,9 +30,9 @@ from bridge.vehicle_node import NOT_ACTIVE, WATCH_PERIOD, VehicleNode, add_optio
 from bridge.view import view_of
 
 PAUSE = (0.01, 0.06)
-"""Seconds after a frame between which there is time for housekeeping: the last command is out, the next frame far."""
+"""Seconds after a step between which there is time for housekeeping: the last command is out, the next step far."""
 SILENCE = 0.3
-"""Seconds without a frame after which there is always time."""
+"""Seconds without a step after which there is always time."""
 CLOCK_STANDS = "simulated time stands"
 MIXED = "an input has two publishers"
 STARTING = 2.0
@@ -100,7 +100,6 @@ class DriveNode(VehicleNode):
         self._incompatible = False
         self._publishers: dict[str, list[Endpoint]] = {}
         self._camera_since = self._started
-        self._last_frame = -math.inf
         pacer = controller.policy.pacer
         self._topics = {name: SenseTopic(node.resolve_topic_name(self._topic_name(name, topic)), topic.kind)
                         for name, topic in topics_of(controller.policy.sensors).items()}
@@ -126,8 +125,8 @@ class DriveNode(VehicleNode):
         return self.options.image_topic if paces else topic.topic
 
     def has_time(self, now: float) -> bool:
-        """Return whether the last command is out and the next frame far."""
-        since = now - self._last_frame
+        """Return whether the last command is out and the next step far."""
+        since = now - self.controller.stepped
         return PAUSE[0] <= since <= PAUSE[1] or since > SILENCE
 
     def _watch_simulated_time(self) -> None:
@@ -206,7 +205,7 @@ class DriveNode(VehicleNode):
     def _took_paced(self, now: float, stamp: float, age: float, command: Command | None) -> None:
         """Send what a message of the pacer gave, and note the message."""
         self._publish(command)
-        self._last_frame, self._incompatible = now, False
+        self._incompatible = False
         digest = -self.supervisor.counts["unusable"] if self.controller.unusable else self.controller.digest
         self._frames.frame(now, stamp, age, digest)
 

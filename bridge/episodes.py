@@ -23,6 +23,8 @@ import socket
 import socketserver
 import struct
 import threading
+import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -34,7 +36,7 @@ LARGEST = 65536
 PATIENCE = 5.0
 """Seconds in which a message that has begun must be whole, and in which a new client must say hello."""
 FAREWELL = 0.5
-"""Seconds of silence after which a refused client is left."""
+"""Seconds of silence after which a refused client is left; one that goes on sending is left after PATIENCE."""
 CLIENTS = 8
 """Clients at a time; further ones are refused."""
 LENGTH = struct.Struct(">I")
@@ -67,17 +69,21 @@ def receive(connection: socket.socket, wait: float | None) -> dict[str, Any] | N
         TimeoutError: nothing came, or not all of it.
     """
     connection.settimeout(wait)
-    head = _read(connection, LENGTH.size)
+    begun = connection.recv(LENGTH.size)
+    if not begun:
+        return None
+    end = time.monotonic() + PATIENCE
+    head = _read(connection, LENGTH.size, end, begun)
     if head is None:
         return None
     (length,) = LENGTH.unpack(head)
     if length > LARGEST:
         raise ProtocolError(f"a message of {length} bytes is longer than {LARGEST}")
-    content = _read(connection, length)
+    content = _read(connection, length, end)
     if content is None:
         return None
     try:
-        message = json.loads(content)
+        message = json.loads(content.decode(), object_pairs_hook=_table)
     except (ValueError, RecursionError) as error:
         raise ProtocolError(f"no JSON: {error}") from error
     if not isinstance(message, dict):
@@ -85,15 +91,29 @@ def receive(connection: socket.socket, wait: float | None) -> dict[str, Any] | N
     return message
 
 
-def _read(connection: socket.socket, count: int) -> bytes | None:
-    """Return this many bytes, None where the connection ends before; after the first byte PATIENCE holds."""
-    parts = bytearray()
+def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object, whose keys must differ."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        raise ValueError("a key is given twice")
+    return table
+
+
+def _read(connection: socket.socket, count: int, end: float, begun: bytes = b"") -> bytes | None:
+    """Return this many bytes, of which some may be there, None where the connection ends before.
+
+    Raises:
+        TimeoutError: they have not come by the steady time `end` [s], however steadily they trickle.
+    """
+    parts = bytearray(begun)
     while len(parts) < count:
+        left = end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError(f"a message was not whole within {PATIENCE:g} s")
+        connection.settimeout(left)
         part = connection.recv(count - len(parts))
         if not part:
             return None
-        if not parts:
-            connection.settimeout(PATIENCE)
         parts += part
     return bytes(parts)
 
@@ -104,8 +124,8 @@ def _part(connection: socket.socket, why: str) -> None:
         connection.sendall(encode({"id": None, "error": why}))
         connection.shutdown(socket.SHUT_WR)
         connection.settimeout(FAREWELL)
-        left = 16 * LARGEST
-        while left > 0 and (part := connection.recv(LARGEST)):
+        left, end = 16 * LARGEST, time.monotonic() + PATIENCE
+        while left > 0 and time.monotonic() < end and (part := connection.recv(LARGEST)):
             left -= len(part)
 
 
@@ -196,6 +216,9 @@ class EpisodeServer:
                 return {"id": number, "result": call(message)}, True
         except ValueError as error:
             return {"id": number, "error": str(error)}, greeted
+        except Exception as error:  # whatever a simulator raises is an answer too, and not a lost connection
+            traceback.print_exc()
+            return {"id": number, "error": f"{name} failed: {type(error).__name__}: {str(error)[:1000]}"}, greeted
 
     def _refusal(self, message: dict[str, Any]) -> str:
         """Return why a first message does not open the connection; empty where it does."""
@@ -203,7 +226,8 @@ class EpisodeServer:
             return "the first call must be hello"
         if message.get("protocol") != PROTOCOL:
             return f"protocol {message.get('protocol')!r} is not served; it is {PROTOCOL}"
-        if not hmac.compare_digest(str(message.get("token", "")).encode(errors="surrogatepass"), self._token.encode()):
+        given, want = (one.encode(errors="surrogatepass") for one in (str(message.get("token", "")), self._token))
+        if not hmac.compare_digest(given, want):
             return "the token is wrong"
         return ""
 
@@ -235,6 +259,8 @@ class EpisodeClient:
         self._number += 1
         self._socket.sendall(encode({"id": self._number, "call": name, **arguments}))
         answer = receive(self._socket, self._wait)
+        while answer is not None and isinstance(answer.get("id"), int) and answer["id"] < self._number:
+            answer = receive(self._socket, self._wait)  # that was to a call whose time was over
         if answer is None:
             raise ConnectionError("the simulator closed the connection")
         if "error" in answer:
@@ -258,3 +284,10 @@ def number(message: dict[str, Any], name: str, low: float, high: float, default:
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise ValueError(f"{name} is {repr(value)[:60]}; it must be a number from {low:g} to {high:g}")
     return float(value)
+
+
+def whole(message: dict[str, Any], name: str, low: int, high: int, default: int | None = None) -> int:
+    """Return a whole number of a message; errors as of `number`."""
+    if not isinstance(message.get(name, default), int):
+        raise ValueError(f"{name} is {repr(message.get(name))[:60]}; it must be a whole number from {low} to {high}")
+    return int(number(message, name, low, high, default))

@@ -9,6 +9,7 @@ gives no sign of life for SILENCE seconds, the guard publishes zeros. It never p
 
 import argparse
 import json
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from bridge.commands import CommandTopic
 from bridge.exits import Exit
 from bridge.joystick_lock import JoystickLock
 from bridge.options import Parser, ends_at_ctrl_c, topic_name, whole
+from bridge.parameters import command_line
 from bridge.vehicle_time import VehicleTime
 
 SILENCE = 0.15
@@ -28,7 +30,8 @@ SIMULATED = 10.0
 other, and nobody sits on the vehicle."""
 WATCH_PERIOD = 0.01
 LATE = 0.05
-"""A watch that comes this much [s] after the one before has not yet read what arrived meanwhile, and judges nothing."""
+"""A watch that comes this much [s] after the one before has not yet read what arrived meanwhile. It judges by what had
+arrived at the one before, so a guard that always comes late still stops a dead node."""
 BEAT_PERIOD = 0.05
 REPEATS = 10
 """Zeros sent per stop, 50 ms apart."""
@@ -76,16 +79,17 @@ class Watchdog:
 
     def tick(self, now: float) -> bool:
         """Return whether to publish a zero now."""
-        late, self._ticked = now - self._ticked > LATE, now
+        read = self._ticked if now - self._ticked > LATE else now  # until when all that arrived has been read
+        self._ticked = now
         for session, alive in list(self._driving.items()):
-            if now - alive > self.silence and not late:
+            if read - alive > self.silence:
                 del self._driving[session]
                 self.abandoned = True
                 if not self._stands:
                     self._left, self._next = REPEATS, now
                     self.stops += 1
         for session, heard in list(self.heard.items()):
-            if now - heard > FORGET:
+            if read - heard > FORGET:
                 del self.heard[session]
                 self.abandoned = self.abandoned or not self.heard
         if self._left and now >= self._next:
@@ -151,9 +155,9 @@ class GuardNode:
 
     def _on_look(self) -> None:
         """Find out whether a zero would reach the base."""
-        before = self._ready
-        listeners = [end for end in self.topic.listeners() if end.type.endswith("/" + self.topic.kind)]
-        self._ready = self.topic.look() and bool(listeners) and self.topic.matched_listeners() >= len(listeners)
+        before, topic = self._ready, self.topic
+        there = topic.look() and any(map(topic.hears_us, topic.listeners()))
+        self._ready = there and (before or topic.reaches_all())  # a further reader does not end a drive
         if self._ready and not before:
             self.node.get_logger().info(f"guarding {self.topic.name} ({self.topic.kind})")
 
@@ -197,18 +201,19 @@ class GuardLink:
             self._process, self._started = self._start(), now
             self._heard, self._trusted = None, -self.STALE  # what the one before said counts no more
 
-    def heard(self, now: float, text: str) -> None:
-        """Take a heartbeat of a guard."""
+    def heard(self, now: float, text: str) -> bool:
+        """Take a heartbeat of a guard; return whether it counts: not where a trusted one is there beside it."""
         beat = read_beat(text, topic=str, type=str, ready=bool, zeros=int, stops=int, hears=list)
         if not beat:
-            return
+            return False
         ours = beat["topic"] == self.topic and self.session in beat["hears"]
         if not ours and now - self._trusted < self._stale:
-            return  # a second guard, such as that of an earlier node that was killed
+            return False  # a second guard, such as that of an earlier node that was killed
         if ours:
             self._trusted = now
         self._heard, self._beat = now, beat
         self.zeros, self.stops = beat["zeros"], beat["stops"]
+        return True
 
     def problem(self, now: float) -> str:
         """Return why nobody would stop the vehicle if this process died; empty where a guard would."""
@@ -226,7 +231,11 @@ class GuardLink:
         """End the guard that was started."""
         if self._process is not None and self._process.poll() is None:
             self._process.terminate()
-            self._process.wait(5)
+            try:
+                self._process.wait(5)
+            except subprocess.TimeoutExpired:  # it was stopped, or has no processor
+                self._process.kill()
+                self._process.wait()
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
@@ -247,7 +256,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Guard until SIGTERM, Ctrl-C or the end of the node that is followed."""
-    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, ros_arguments = command_line(arguments, "bridge.guard")
     options = parse_arguments(own)
     with ros.node_session(ros.GUARD_NAME, ros_arguments, options.realtime) as node:
         ros.spin(node, GuardNode(node, options).finished)

@@ -1,7 +1,7 @@
 """What may stop the vehicle from outside: emergency stop, enable, dead-man button, collision sensor.
 
-An emergency stop that is not heard is pulled: "unknown" is stop. The inputs hear publishers of both durabilities, so a
-stop that was latched before the bridge started is known as soon as its publisher is found.
+An emergency stop that is not heard is pulled: "unknown" is stop. The inputs hear publishers of any quality of service,
+so a stop that was latched before the bridge started is known as soon as its publisher is found.
 """
 
 import argparse

@@ -78,9 +78,9 @@ class Player:
         if self.finished:
             return self._send(supervisor.tick(now))
         at = self.clock(now)
-        if at < self._due - 1e-6:  # stamps of simulated time are not exact sums of the period
+        if 1e-6 < self._due - at < 2 * PERIOD:  # stamps of simulated time are not exact sums of the period
             return None
-        self._due = at + PERIOD if at - self._due > PERIOD else self._due + PERIOD
+        self._due = at + PERIOD if abs(at - self._due) > PERIOD else self._due + PERIOD  # also where time began again
         self._rows += 1
         supervisor.frame(now, now, self._rows)
         if not supervisor.may_drive:
@@ -171,13 +171,27 @@ class ManoeuvreNode(VehicleNode):
                 self.supervisor.latch("the recording failed")
                 self.failure = str(error)
         elif recorder.writer is not None and player.elapsed is None:
-            writer, recorder.writer = recorder.writer, None
-            if player.driven > self._driven_before:
+            self._end_recording(recorder)
+
+    def _end_recording(self, recorder: RecordNode) -> None:
+        """Make a trial of a replicate that was driven to its end, and put any other one aside."""
+        writer, recorder.writer = recorder.writer, None
+        try:
+            if self.player.driven > self._driven_before:
                 self.trials.append(writer.close())
                 self.node.get_logger().info(f"{self.trials[-1]}: rows {writer.rows}")
             else:
                 aside = writer.put_aside()
                 self.node.get_logger().warning(f"stopped on the way; what was recorded is in {aside}")
+        except OSError as error:
+            self.supervisor.latch("the recording failed")
+            self.failure = self.failure or str(error)
+
+    def close(self) -> None:
+        """End the node, and the recording of a replicate that is on its way."""
+        super().close()
+        if self._recorder is not None and self._recorder.writer is not None:
+            self._end_recording(self._recorder)
 
     def _trial_name(self) -> str:
         return f"{self.options.trial}_{self.options.first + self.player.driven}"
@@ -185,10 +199,15 @@ class ManoeuvreNode(VehicleNode):
 
 def _enter_was_pressed() -> bool:
     """Return whether the operator pressed Enter in the terminal; False where there is no terminal."""
-    if not sys.stdin or not sys.stdin.isatty() or os.getpgrp() != os.tcgetpgrp(sys.stdin.fileno()):
+    if not sys.stdin or not sys.stdin.isatty():
         return False
-    ready, _, _ = select.select([sys.stdin], [], [], 0)
-    return bool(ready) and sys.stdin.readline().strip() == ""
+    try:
+        in_front = os.getpgrp() == os.tcgetpgrp(sys.stdin.fileno())
+    except OSError:  # not the terminal of this session, as after setsid
+        return False
+    ready, _, _ = select.select([sys.stdin], [], [], 0) if in_front else ([], [], [])
+    line = sys.stdin.readline() if ready else ""
+    return line.endswith("\n") and not line.strip()  # the end of the input, Ctrl-D, is no Enter
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:

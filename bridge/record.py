@@ -25,6 +25,7 @@ from bridge.commands import CommandListener
 from bridge.exits import Exit, OptionError, refusal
 from bridge.mcap_file import mend
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
+from bridge.parameters import command_line
 from bridge.split_writer import SplitWriter
 from bridge.streams import DEPTH, Stream
 from bridge.trial_writer import MCAP, PARTIAL, TrialWriter
@@ -76,7 +77,7 @@ def toml_text(text: str) -> str:
 
 
 class StampedListener(CommandListener):
-    """Hears commands with their own time, and whole."""
+    """Hears commands with their own time, and whole; best effort, so that no recorder ever holds up a command."""
 
     def __init__(self, node: Any, topic: str, on_message: Callable[[Any, float, float, float], None]) -> None:
         """Listen in the type that the base hears.
@@ -84,6 +85,8 @@ class StampedListener(CommandListener):
         `on_message` gets the message, its stamp [s] (0 where it has none), v [m/s] and omega [rad/s].
         """
         self._on_message = on_message
+        self.lost = 0
+        """Commands that the middleware reports as lost."""
         super().__init__(node, topic, "auto", lambda v, omega: None)
 
     def _open(self, kind: str) -> None:
@@ -95,8 +98,12 @@ class StampedListener(CommandListener):
                 planar, stamp = message.twist, ros.stamp_seconds(message.header.stamp)
             self._on_message(message, stamp, planar.linear.x, planar.angular.z)
 
+        def count(event: Any) -> None:
+            self.lost += event.total_count_change
+
         self.kind = kind
-        ros.subscribe_own(self.node, getattr(msg, kind), self.name, heard, ros.best_effort(DEPTH))
+        topic = ros.Topic(getattr(msg, kind), self.name, ros.best_effort(DEPTH))
+        ros.subscribe_counting_losses(self.node, topic, heard, count, use_default_callbacks=False)
 
 
 class RecordNode:
@@ -134,7 +141,7 @@ class RecordNode:
 
     def lost(self) -> dict[str, int]:
         """Return how many messages of each topic the middleware lost, where it lost any."""
-        heard = [*self.streams, *(self._whole or {}).values()]
+        heard: list[StampedListener | Stream] = [self._commands, *self.streams, *(self._whole or {}).values()]
         return {stream.name: stream.lost for stream in heard if stream.lost}
 
     def _look(self) -> None:
@@ -348,6 +355,11 @@ def main_recover(dataset: Path) -> int:
         return refusal(error)
     for folder in found:
         print(f"bridge.record: {folder}: recovered", file=sys.stderr)
+    for left in sorted(dataset.glob(".*.partial-*")):
+        if match := PARTIAL.fullmatch(left.name):
+            print(f"bridge.record: {left}: left alone, because a process {match['process']} runs. End it, or where it "
+                  "is another program, rename the folder", file=sys.stderr)
+            return Exit.DONE
     if not found:
         print(f"bridge.record: {dataset}: no recording of a killed recorder is there", file=sys.stderr)
     return Exit.DONE
@@ -359,7 +371,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Returns an `Exit`: FAULT where nothing can be written, also on the way, SHORT without odometry.
     """
-    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, ros_arguments = command_line(arguments, "bridge.record")
     options = parse_arguments(own)
     if options.recover:
         return main_recover(options.dataset)

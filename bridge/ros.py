@@ -42,6 +42,8 @@ DRIVE_NAME = "bridge_drive"
 GUARD_NAME = "bridge_guard"
 RECORD_NAME = "bridge_record"
 MANOEUVRE_NAME = "bridge_manoeuvre"
+ENDLESS = 10**18
+"""Nanoseconds from which a deadline is none: DDS has 2^63 - 1 for it."""
 PROFILE = Path(__file__).with_name("fastdds.xml")
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -82,11 +84,11 @@ def reliable(depth: int = 1) -> Any:
     return QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 
 
-def latched() -> Any:
-    """A state that late joiners must get: reliable, and the last value is kept for them."""
+def latched(depth: int = 1) -> Any:
+    """A state that late joiners must get: reliable, and the last values are kept for them."""
     from rclpy.qos import DurabilityPolicy
 
-    profile = reliable()
+    profile = reliable(depth)
     profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
     return profile
 
@@ -155,16 +157,33 @@ def is_reliable(policy: Any) -> bool:
     return bool(policy == ReliabilityPolicy.RELIABLE)
 
 
-def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
-    """Subscribe to a state such as an emergency stop, whatever durability its publisher offers.
+def hears_commands(requested: Any) -> bool:
+    """Return whether a subscriber's quality of service, as the graph gives it, lets it hear `reliable` commands.
 
-    A volatile reader hears all publishers but gets no earlier value; a transient-local one gets the value that was
-    latched before the bridge started, but hears latching publishers only. Each value may come twice.
+    They are not kept for late joiners, and promise no deadline. `qos_check_compatible` of rclpy takes the endless
+    deadline of the graph for one.
     """
-    node.create_subscription(kind, topic, callback, reliable(10))
-    # that a volatile publisher does not fit the second reader is no fault: the first one hears it
-    node.create_subscription(kind, topic, callback, latched(),
-                             event_callbacks=subscription_events(incompatible_qos=lambda _: None))
+    return not is_latched(requested.durability) and not 0 < requested.deadline.nanoseconds < ENDLESS
+
+
+def is_latched(policy: Any) -> bool:
+    """Return whether a publisher's durability, as the graph gives it, keeps values for late joiners."""
+    from rclpy.qos import DurabilityPolicy
+
+    return bool(policy == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def subscribe_state(node: Any, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
+    """Subscribe to a state such as an emergency stop, whatever quality of service its publisher offers.
+
+    No single reader does. A best-effort one hears all publishers, but may lose a message and gets no earlier value. A
+    reliable one loses nothing. A transient-local one gets the value that was latched before the bridge started. Each
+    value may come three times.
+    """
+    for profile in (best_effort(10), reliable(10), latched()):
+        # that a publisher does not fit one of the readers is no fault: the first one hears it
+        node.create_subscription(kind, topic, callback, profile,
+                                 event_callbacks=subscription_events(incompatible_qos=lambda _: None))
 
 
 def diagnostics(node: Any) -> Callable[[bool, str, dict[str, Any]], None]:

@@ -18,6 +18,8 @@ from bridge import ros
 from bridge.commands import CommandTopic
 from bridge.episodes import EpisodeClient
 from bridge.image import to_rgb8
+from bridge.safety import SafetyConfig
+from bridge.senses import AGE
 
 PATIENCE = 5.0
 """Seconds without the image that is waited for."""
@@ -161,10 +163,15 @@ class RosEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._take(stamp)
 
     def _wait_for_newer(self, than: tuple[int, int]) -> np.ndarray:
-        end = time.monotonic() + PATIENCE
+        """Return the next image of a vehicle, which is stopped where none comes for as long as the bridge tolerates."""
+        began, stopped = time.monotonic(), False
         while self._newest <= than:
             self._executor.spin_once(timeout_sec=0.05)
-            if time.monotonic() > end:
+            waited = time.monotonic() - began
+            if not stopped and waited > max(SafetyConfig.frame_age, AGE * self.period):
+                self._send(0.0, 0.0)
+                stopped = True
+            if waited > PATIENCE:
                 raise TimeoutError(f"no new image came within {PATIENCE:g} s. Check the camera and its topic.")
         return self._take(self._newest)
 

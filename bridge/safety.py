@@ -231,6 +231,8 @@ class Supervisor:
             self.counts["overrun"] += 1
         if not np.isfinite(action).all():
             self._count_bad_action(now)
+        elif self._frames.is_silent(now + elapsed):
+            self.fault("frame age")  # the step, or the whole process, was held up
         elif self._overruns >= 3:
             self._overruns = 0
             self.fault("policy too slow")

@@ -147,6 +147,7 @@ class Senses:
                                   np.float32)
         self._origins: dict[str, np.ndarray] = {}
         self._turned: dict[str, float] = {}
+        self.watch(0.0)
 
     @property
     def complete(self) -> bool:

@@ -27,6 +27,7 @@ from bridge import ros
 from bridge.episodes import EpisodeServer
 from bridge.exits import Exit, OptionError
 from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
+from bridge.parameters import command_line
 from bridge.policy import PolicyFileError, pacer_of
 from bridge.simulate_node import RESULTS, SimulateNode
 from bridge.simulated import SCAN_HEIGHT, SCAN_RANGE, SCAN_RAYS, Frame, Grid, SimulatedVehicle
@@ -346,7 +347,7 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Run the node until its episodes are over, SIGTERM or Ctrl-C; return an `Exit`."""
-    own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, ros_arguments = command_line(arguments, "bridge.simulate", "policy")
     options = parse_arguments(own)
     compiling: Any = contextlib.nullcontext()
     if options.simulator.startswith("bridge.simulate:"):  # others may abort with it

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge import ros
-from bridge.episodes import PROTOCOL, Calls, number
+from bridge.episodes import PROTOCOL, Calls, number, whole
 from bridge.policy import pacer_of
 from bridge.sense_topics import message_of, topics_of
 from bridge.simulated import Episode, Frame, SimulatedClock, SimulatedVehicle, enlarge, halfway
@@ -135,14 +135,14 @@ class SimulateNode:
         return {"mode": mode}
 
     def _call_reset(self, message: dict[str, Any]) -> dict[str, Any]:
-        seed = int(number(message, "seed", 0, 2**31 - 1))
+        seed = whole(message, "seed", 0, 2**31 - 1)
         self.finished_at = None
         stamp = self._begin(seed)
         return {"episode": len(self.episodes), "stamp": stamp}
 
     def _call_step(self, message: dict[str, Any]) -> dict[str, Any]:
         v, omega = (number(message, name, -100, 100) for name in ("v", "omega"))
-        periods = int(number(message, "periods", 1, 1000, 1))
+        periods = whole(message, "periods", 1, 1000, 1)
         if not self.stepped:
             raise ValueError("steps need the mode step; call mode first")
         reward = 0.0
@@ -201,7 +201,8 @@ class SimulateNode:
         now = time.monotonic()
         if now - self._ready_at > self.options.wait or self.episodes:
             return True
-        if not self._image.get_subscription_count() or not self.node.count_publishers(ros.COMMAND_TOPIC):
+        topic = self.node.resolve_topic_name(ros.COMMAND_TOPIC)  # the count heeds no remapping
+        if not self._image.get_subscription_count() or not self.node.count_publishers(topic):
             self._alone_at = now
         return now - self._alone_at > MATCHING
 

@@ -1,6 +1,7 @@
 """One trial of a driving-log dataset, written row by row while it is driven."""
 
 import contextlib
+import itertools
 import math
 import os
 import re
@@ -35,7 +36,11 @@ class TrialWriter:
         self.folder = self.check(dataset, trial)
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self._partial = Path(dataset) / f".{trial}.partial-{os.getpid()}"
-        self._partial.mkdir()
+        try:
+            self._partial.mkdir()
+        except FileExistsError:
+            raise OptionError(f"{self._partial}: is a recording that was killed. Make a trial of it with --recover, or "
+                              "remove it.") from None
         self._files: dict[str, IO[str]] = {}
         self._mcap: McapWriter | None = None
         self._origin: float | None = None
@@ -150,7 +155,8 @@ class TrialWriter:
         """
         aside = self.folder.parent.with_name("aborted")
         aside.mkdir(exist_ok=True)
-        self.folder = aside / f"{self.folder.name}.{sum(1 for _ in aside.iterdir()) + 1}"
+        names = (f"{self.folder.name}.{k}" for k in itertools.count(1))
+        self.folder = aside / next(name for name in names if not (aside / name).exists())
         return self.close()
 
     def _is_early(self, stream: str, t: float) -> bool:

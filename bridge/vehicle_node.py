@@ -30,6 +30,9 @@ WATCH_PERIOD = 0.01
 LOOK_PERIOD = 0.2
 """Seconds between two looks at the graph."""
 STATUS_PERIOD = 1.0
+OVERDUE = 2.0
+"""Seconds after which graph and status get their turn although it delays a command: a policy whose steps come one upon
+the other leaves no time, and yet it needs a guard, and its operator a status."""
 CLOCK_STEP = 0.1
 """Difference [s] of wall and steady clock between two watches that counts as a clock jump."""
 NO_GUARD, NO_BASE, COMMANDERS = "no guard", "no base listens", "another node publishes commands"
@@ -177,8 +180,9 @@ class VehicleNode:
         if self._ear.foreign_zero():
             self.supervisor.foreign_command(now)
         self._publish(self.decider.on_tick(now))
-        if self.has_time(now):
-            self._keep_house(time.monotonic())
+        steady = time.monotonic()
+        if self.has_time(now) or steady - min(self._looked, self._said) > OVERDUE:
+            self._keep_house(steady)
 
     def _keep_house(self, now: float) -> None:
         """Look at the graph and report, where it is time: by the steady clock, since a graph does not wait."""
@@ -194,7 +198,8 @@ class VehicleNode:
 
     def _on_guard(self, message: Any) -> None:
         now = self.now()
-        self.guard.heard(now, message.data)
+        if not self.guard.heard(now, message.data):
+            return
         self._ear.guard_reports(self.guard.zeros)
         if self.guard.stops > self._guard_stops and self._lock is not None:
             self._lock.forget()  # the guard has unlocked it
@@ -215,6 +220,8 @@ class VehicleNode:
         if not self.supervisor.arm():
             why = ", ".join(self.supervisor.holds) or self.supervisor.reason
             self.node.get_logger().error(f"not armed: {why} still holds")
+        elif self._lock is not None:
+            self._lock.follow(self.now(), self.supervisor)  # now: a frame may come before the next watch
 
     def _on_beat(self) -> None:
         self._beat(self.supervisor.may_drive)
@@ -230,8 +237,7 @@ class VehicleNode:
         self.guard.keep(now)
         self.commands.look()
         self._listeners = self.commands.listeners()
-        fitting = [end for end in self._listeners if end.type.endswith("/" + self.commands.kind)]
-        self.supervisor.block(NO_BASE, not (self.commands.kind and fitting))
+        self.supervisor.block(NO_BASE, not any(map(self.commands.hears_us, self._listeners)))
         self._others.look(now, self.commands.commanders())
         self._commanders = self._others.names(now)
         alone = not self.options.allow_other_commanders

@@ -6,6 +6,8 @@ itself limits nothing, has no time-out and publishes no odometry.
 """
 
 import math
+import statistics
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,15 +113,23 @@ class WheelOdometry:
         """Gaps that were too long."""
         self._radius, self._tread, self._longest_gap = wheel_radius, tread, longest_gap
         self._last: tuple[float, ChairState] | None = None
+        self._intervals: deque[float] = deque(maxlen=5)
+        self._places: deque[tuple[float, float, float]] = deque(maxlen=5)  # last times [s], ways [m], yaws [rad]
+        self._way = 0.0
 
     def update(self, now: float, state: ChairState) -> Odometry:
-        """Take a state at a steady time [s]; return pose and mean speed since the last one."""
+        """Take a state at a steady time [s]; return pose and mean speed since the last one.
+
+        A state has no stamp, and one that was held up comes just before the next one. So what comes sooner than half
+        the usual interval gives the mean speed since the one before that.
+        """
         before, self._last = self._last, (now, state)
         if before is None or now <= before[0]:
             return self.pose
         elapsed = now - before[0]
         if elapsed > self._longest_gap:
             self.gaps += 1
+            self._places.clear()
             return self.pose
         left = self._travel(before[1].left_motor_angle, state.left_motor_angle,
                             before[1].left_motor_speed, state.left_motor_speed, elapsed)
@@ -128,9 +138,19 @@ class WheelOdometry:
         distance, turn = (left + right) / 2, (right - left) / self._tread
         pose, half = self.pose, turn / 2
         chord = distance * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+        self._places.append((before[0], self._way, pose.yaw))
+        self._intervals.append(elapsed)
+        self._way += distance
+        v, omega = self._speed(now, pose.yaw + turn)
         self.pose = Odometry(pose.x + chord * math.cos(pose.yaw + half), pose.y + chord * math.sin(pose.yaw + half),
-                             pose.yaw + turn, distance / elapsed, turn / elapsed)
+                             pose.yaw + turn, v, omega)
         return self.pose
+
+    def _speed(self, now: float, yaw: float) -> tuple[float, float]:
+        """Return v [m/s] and omega [rad/s] since the newest place that is half a usual interval old, or the oldest."""
+        least = statistics.median(self._intervals) / 2
+        at, way, before = next((one for one in reversed(self._places) if now - one[0] >= least), self._places[0])
+        return (self._way - way) / (now - at), (yaw - before) / (now - at)
 
     def _travel(self, before: float, after: float, speed_before: float, speed_after: float, elapsed: float) -> float:
         """Return how far a wheel rolled [m].

@@ -8,8 +8,10 @@ from pathlib import Path
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
+
+PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -22,7 +24,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("image", default_value="sensing/camera/front/image_raw"),
         DeclareLaunchArgument("command", default_value="whill/controller/cmd_vel"),
         # camera nodes that are started from here get the profile too: large images are lost without it
-        SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", str(share / "fastdds.xml")),
+        SetEnvironmentVariable(PROFILE, EnvironmentVariable(PROFILE, default_value=str(share / "fastdds.xml"))),
         Node(package="whill_bridge", executable="bridge_drive", name="bridge_drive", output="screen",
              namespace=LaunchConfiguration("namespace"), parameters=[LaunchConfiguration("parameters")],
              arguments=[LaunchConfiguration("policy")],

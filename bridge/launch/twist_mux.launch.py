@@ -27,6 +27,9 @@ def generate_launch_description() -> LaunchDescription:
         Node(package="nav2_velocity_smoother", executable="velocity_smoother", name="velocity_smoother",
              parameters=[{"smoothing_frequency": 20.0, "velocity_timeout": 0.2}],
              remappings=[("cmd_vel", "nav/cmd_vel"), ("cmd_vel_smoothed", "nav/cmd_vel_smoothed")]),
+        # the smoother is a lifecycle node: it passes nothing before it is activated
+        Node(package="nav2_lifecycle_manager", executable="lifecycle_manager", name="lifecycle_manager_smoother",
+             parameters=[{"autostart": True, "node_names": ["velocity_smoother"]}]),
         Node(package="twist_mux", executable="twist_mux", name="twist_mux", parameters=[str(config / "twist_mux.yaml")],
              remappings=[("cmd_vel_out", "whill/controller/cmd_vel")]),
     ])

@@ -94,6 +94,7 @@ class QoSProfile:
     history: str = ""
     reliability: str = "RELIABLE"
     durability: str = "VOLATILE"
+    deadline: Duration = Duration()
 
 
 class Policy:
@@ -186,7 +187,7 @@ class Node:
 
     def get_subscriptions_info_by_topic(self, topic_name, no_mangle=False):
         kind = self.topics.get(topic_name)
-        info = types.SimpleNamespace(node_name="base", node_namespace="/", topic_type=kind)
+        info = types.SimpleNamespace(node_name="base", node_namespace="/", topic_type=kind, qos_profile=QoSProfile(10))
         return [info] if kind else []
 
     def deliver(self, topic, msg):

@@ -91,10 +91,12 @@ def test_second_node_of_the_same_name_is_somebody_else():
                                                                                     "/left/bridge_guard"]
 
 
-def test_neither_the_bridges_own_nodes_nor_one_without_a_name_yet_is_a_base():
+def test_neither_the_bridges_own_nodes_nor_one_without_a_name_yet_is_a_base(monkeypatch):
     names = [("/", "bridge_drive"), ("/", "bridge_guard"), ("/", "bridge_record"),
              ("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_"), ("/left", "bridge_guard"), ("/", "base")]
-    infos = [types.SimpleNamespace(node_namespace=space, node_name=name, topic_type=TWIST) for space, name in names]
+    monkeypatch.setattr("bridge.commands.ros.hears_commands", lambda requested: True)
+    infos = [types.SimpleNamespace(node_namespace=space, node_name=name, topic_type=TWIST, qos_profile=None)
+             for space, name in names]
     node = types.SimpleNamespace(
         resolve_topic_name=lambda topic: f"/{topic}", get_namespace=lambda: "/", get_name=lambda: "bridge_guard",
         get_subscriptions_info_by_topic=lambda topic: infos)

@@ -63,6 +63,7 @@ def test_nothing_is_named_where_all_is_well():
     ({"listeners": [], "command_type": ""}, ["no base listens on /cmd_vel", "start its driver"]),
     ({"listeners": [Endpoint("/base", STAMPED)]}, [STAMPED, "the bridge sends Twist", "--command-type auto"]),
     ({"listeners": [Endpoint("/base", "std_msgs/msg/String")], "command_type": ""}, ["cannot send"]),
+    ({"listeners": [Endpoint("/base", TWIST, hears=False)]}, ["the base on /cmd_vel asks for a quality of service"]),
     ({"commanders": ["/joystick"]}, ["/joystick", "twist_mux"]),
     ({"guard": "no guard is running"}, ["no guard is running"]),
 ])

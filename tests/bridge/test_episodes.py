@@ -9,7 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.episodes import CLIENTS, LARGEST, EpisodeClient, EpisodeServer, ProtocolError, encode, number, receive
+from bridge import episodes
+from bridge.episodes import (
+    CLIENTS,
+    LARGEST,
+    EpisodeClient,
+    EpisodeServer,
+    ProtocolError,
+    encode,
+    number,
+    receive,
+    whole,
+)
 
 pytestmark = pytest.mark.quick
 
@@ -75,6 +86,8 @@ def test_a_first_message_that_is_no_greeting_is_refused(server, message, words):
     (struct.pack(">I", 2) + b"[]", "JSON object"),
     (struct.pack(">I", 4) + b"\xff\xfe\x00\x01", "no JSON"),
     (struct.pack(">I", 60000) + b"[" * 60000, "no JSON"),
+    (struct.pack(">I", 16) + b'{"id":1,"id": 2}', "no JSON: a key is given twice"),
+    (struct.pack(">I", 36) + '{"call": "hello"}'.encode("utf-16"), "no JSON"),
 ])
 def test_bytes_that_are_no_message_are_named(server, content, words):
     assert words in raw(server, content)["error"]
@@ -98,6 +111,56 @@ def test_server_still_serves_after_all_that(server):
     client = EpisodeClient(server.port)
     assert client.call("double", value=2) == {"twice": 4}
     client.close()
+
+
+def test_a_client_that_trickles_a_message_is_left(monkeypatch):
+    monkeypatch.setattr(episodes, "PATIENCE", 0.5)
+    server = EpisodeServer(CALLS)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=0.1) as connection:
+        connection.sendall(struct.pack(">I", 1000))
+        for _ in range(100):
+            try:
+                connection.sendall(b" ")
+                if connection.recv(1) == b"":
+                    break
+            except TimeoutError:
+                continue  # it still waits
+            except OSError:
+                break
+        else:
+            pytest.fail("the server waits for a message that never becomes whole")
+    server.close()
+
+
+def test_an_answer_that_comes_too_late_is_not_taken_for_that_of_the_next_call():
+    free = threading.Event()
+    server = EpisodeServer({**CALLS, "slow": lambda _: {"waited": free.wait(60)}})
+    client = EpisodeClient(server.port)
+    client._wait = 0.1
+    with pytest.raises(TimeoutError):
+        client.call("slow")
+    client._wait = 60
+    free.set()
+    assert client.call("double", value=3) == {"twice": 6}
+    client.close()
+    server.close()
+
+
+def test_a_simulator_that_raises_gives_its_error_as_the_answer(capsys):
+    server = EpisodeServer({**CALLS, "break": lambda _: {}["x"]})
+    client = EpisodeClient(server.port)
+    with pytest.raises(ProtocolError, match="break failed: KeyError: 'x'"):
+        client.call("break")
+    assert client.call("double", value=3) == {"twice": 6} and "KeyError" in capsys.readouterr().err
+    client.close()
+    server.close()
+
+
+@pytest.mark.parametrize("value", [1.5, 1.0, True, "1", None, -1, 11])
+def test_a_whole_number_of_a_message_is_whole_and_in_its_range(value):
+    with pytest.raises(ValueError, match="seed is .*; it must be a"):
+        whole({"seed": value}, "seed", 0, 10)
+    assert whole({"seed": 4}, "seed", 0, 10) == 4 and whole({}, "seed", 0, 10, 2) == 2
 
 
 def test_more_clients_than_there_are_places_are_told_so():

@@ -58,6 +58,20 @@ def test_base_that_is_gone_is_named(graph, policy):
     robot.wait_for_status(state="standing", reason="no base listens", causes="no base listens")
 
 
+def test_base_whose_quality_of_service_does_not_fit_is_named_and_nothing_drives(graph, policy):
+    from bridge import ros
+
+    robot = graph.peer("robot")
+    robot.watch(), robot.camera(), robot.e_stop()
+    twist, heard = message_type("geometry_msgs/Twist"), []
+    robot.node.create_subscription(twist, "whill/controller/cmd_vel", heard.append, ros.latched())
+    graph.start("drive", policy)
+    robot.wait_for_status(state="standing", holds="no base listens", causes="asks for a quality of service")
+    robot.base()
+    robot.wait_for_status(driving=True)
+    assert not heard
+
+
 def clock(robot):
     """Publish /clock as the wall clock; the offset of the result moves it."""
     kind = message_type("rosgraph_msgs/Clock")

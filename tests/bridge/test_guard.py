@@ -3,11 +3,14 @@
 import json
 import os
 import signal
+import subprocess
+import types
 
 import pytest
 
 from bridge import ros
-from bridge.guard import GuardLink, Watchdog, read_beat
+from bridge.commands import CommandTopic, Endpoint
+from bridge.guard import GuardLink, GuardNode, Watchdog, read_beat
 
 pytestmark = pytest.mark.quick
 
@@ -71,8 +74,25 @@ def test_guard_forgets_a_node_that_stays_silent():
     guard.heartbeat(0.0, "a", False)
     guard.tick(1.0)
     assert "a" in guard.heard
-    guard.tick(3.0)
+    guard.tick(3.0), guard.tick(3.01)  # the first of them comes late itself, and has not read yet
     assert "a" not in guard.heard
+
+
+@pytest.mark.parametrize("matched, ready", [(2, False), (3, True)])
+def test_guard_is_ready_when_every_reader_is_matched_the_bases_among_them(matched, ready, monkeypatch):
+    node = types.SimpleNamespace(get_logger=lambda: types.SimpleNamespace(info=lambda text: None))
+    guard = GuardNode.__new__(GuardNode)
+    names = ("bridge_drive", "bridge_guard", "base")  # the node's and the guard's own ears are matched first
+    guard.node, guard._ready, topic = node, False, CommandTopic.__new__(CommandTopic)
+    topic.name, topic.kind, topic._known = "/cmd_vel", "Twist", ["/bridge_drive", "/bridge_guard"]
+    topic.publisher = types.SimpleNamespace(get_subscription_count=lambda: matched)
+    monkeypatch.setattr(topic, "readers", lambda: [Endpoint(f"/{name}", "geometry_msgs/msg/Twist") for name in names])
+    guard.topic = topic
+    guard._on_look()
+    assert guard._ready == ready
+    matched = 2  # a reader that comes to a guard that is ready ends nothing
+    guard._on_look()
+    assert guard._ready == ready
 
 
 GOOD = {"topic": "/cmd_vel", "type": "Twist", "ready": True, "zeros": 0, "stops": 0, "hears": ["me"]}
@@ -93,8 +113,8 @@ def test_bridge_trusts_only_a_guard_that_hears_it_and_reaches_its_base(change, p
 def test_guard_of_an_earlier_node_on_the_same_topics_does_not_disturb():
     link = GuardLink("me", "/cmd_vel", None)
     for i in range(20):
-        link.heard(1 + i / 20, json.dumps(GOOD))
-        link.heard(1 + i / 20, json.dumps({**GOOD, "hears": ["dead"], "zeros": 10, "stops": 1}))
+        assert link.heard(1 + i / 20, json.dumps(GOOD))
+        assert not link.heard(1 + i / 20, json.dumps({**GOOD, "hears": ["dead"], "zeros": 10, "stops": 1}))
         assert link.problem(1 + i / 20) == "" and link.stops == 0
     link.heard(3.0, json.dumps({**GOOD, "hears": ["dead"]}))
     assert "does not hear" in link.problem(3.0)
@@ -128,6 +148,27 @@ def test_guard_that_ended_is_started_again_after_a_pause():
     assert len(started) == 2 and link.problem(2.11) == "no guard is running"  # whatever the dead one said
 
 
+def test_guard_that_does_not_end_when_it_is_asked_is_killed():
+    class Stopped(Process):
+        told = ()
+
+        def terminate(self):
+            self.told = (*self.told, "terminate")
+
+        def kill(self):
+            self.told, self.returncode = (*self.told, "kill"), -9
+
+        def wait(self, seconds=None):
+            if self.returncode is None:
+                raise subprocess.TimeoutExpired("guard", seconds)
+
+    process = Stopped()
+    link = GuardLink("me", "/cmd_vel", lambda: process)
+    link.keep(0.0)
+    link.close()
+    assert process.told == ("terminate", "kill") and process.poll() == -9
+
+
 @pytest.mark.parametrize("text", ["", "nonsense", "[]", "{}", '{"session": 3, "driving": true}', '{"session": "a"}'])
 def test_damaged_heartbeat_is_no_heartbeat(text):
     assert read_beat(text, session=str, driving=bool) == {}
@@ -144,6 +185,15 @@ def test_a_guard_that_comes_late_itself_first_reads_what_has_arrived():
     assert not watchdog.tick(1.01) and watchdog.stops == 0
     assert not watchdog.tick(1.04) and not watchdog.tick(1.08) and not watchdog.tick(1.12) and not watchdog.tick(1.15)
     assert watchdog.tick(1.16) and watchdog.stops == 1
+
+
+def test_a_guard_that_always_comes_late_still_stops_a_dead_node():
+    watchdog = Watchdog()
+    for tick in range(20):  # each 80 ms: it shares its processor with others
+        watchdog.heartbeat(0.08 * tick, "a", driving=True)
+        watchdog.command(True)
+        assert not watchdog.tick(0.08 * tick)
+    assert not watchdog.stops and any(watchdog.tick(0.08 * tick) for tick in range(20, 25)) and watchdog.stops == 1
 
 
 class Executor:

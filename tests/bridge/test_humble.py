@@ -43,7 +43,7 @@ def test_modules_compile_under_python_3_10_where_there_is_one(tmp_path):
     subprocess.run([python, "-c", code, *map(str, MODULES)], check=True, cwd=tmp_path)
 
 
-DRIVE = """
+START = """
 import json, sys, time, types
 import humble_stub
 humble_stub.install()
@@ -65,9 +65,12 @@ options = drive.parse_arguments(["policy", "--guard", "other", *sys.argv[1:]])
 node = humble_stub.Node("bridge_drive")
 kind = "TwistStamped" if "stamped" in options.image_topic else "Twist"
 node.topics["/whill/controller/cmd_vel"] = f"geometry_msgs/msg/{kind}"
-bridge = drive.DriveNode(node, Controller(Policy(), SafetyConfig((-1.0, -1.0), (1.0, 1.0), hold_zeros=False)), options)
+safety = SafetyConfig((-1.0, -1.0), (1.0, 1.0), hold_zeros=False, require_arm=options.require_arm)
+bridge = drive.DriveNode(node, Controller(Policy(), safety), options)
 beat = {"topic": "/whill/controller/cmd_vel", "type": kind, "ready": True, "zeros": 0, "stops": 0,
         "hears": [bridge.guard.session]}
+"""
+DRIVE = START + """
 for i in range(6):
     node.clock.nanoseconds = (i + 1) * 10**8
     node.deliver("/bridge/guard", humble_stub.String(data=json.dumps(beat)))
@@ -89,7 +92,36 @@ assert any(report.startswith("driving") for report in reports), reports
 asked = [client.asked for client in node.clients.values()]
 print(json.dumps([[[message.linear.x, message.angular.z] for message in sent], asked]))
 """
-
+ARM = START + """
+(driver,) = node.clients.values()
+driver.ready = False  # it unlocked at the start, and answers nothing more
+for i in range(6):
+    node.clock.nanoseconds = (i + 1) * 10**8
+    node.deliver("/bridge/guard", humble_stub.String(data=json.dumps(beat)))
+    node.deliver("/e_stop", humble_stub.Bool(data=False))
+    image = humble_stub.Image(height=8, width=8, encoding="rgb8", step=24, data=bytes([i]) * 192)
+    image.header.stamp = humble_stub.Time(nanosec=(i + 1) * 10**8)
+    if i == 5:  # a frame comes at once, before any watch
+        node.deliver("/bridge/rearm", humble_stub.Empty())
+    node.deliver("/" + options.image_topic, image)
+    if i < 5:
+        time.sleep(0.012)
+        node.fire()
+print(bridge.supervisor.state.value, bridge.supervisor.holds, node.publishers["/whill/controller/cmd_vel"].sent)
+"""
+FAST = START + """
+vehicle_node.LOOK_PERIOD = vehicle_node.STATUS_PERIOD = 0.02
+vehicle_node.OVERDUE = 0.05
+statuses, end = node.publishers["/bridge/status"].sent, time.monotonic() + 30
+before = len(statuses)
+while len(statuses) < before + 3 and time.monotonic() < end:
+    node.clock.nanoseconds += 10**7
+    image = humble_stub.Image(height=8, width=8, encoding="rgb8", step=24, data=bytes([len(statuses) % 9]) * 192)
+    image.header.stamp = node.clock.now().to_msg()
+    node.deliver("/" + options.image_topic, image)
+    node.fire()  # at once: there is no pause between two steps
+print(len(statuses) - before)
+"""
 
 CHAIR = """
 import sys
@@ -145,3 +177,12 @@ def test_joystick_is_locked_while_the_vehicle_is_armed_and_unlocked_when_its_rid
     words = ("--image-topic", "camera", "--whill-state", "whill/states/model_cr2", "--joystick-lock")
     commands, asked = json.loads(run(DRIVE, tmp_path, *words))
     assert [0.2, 0.1] in commands and asked == [[1, 0]]
+
+
+def test_frame_that_comes_right_after_arming_does_not_drive_before_the_joystick_is_locked(tmp_path):
+    said = run(ARM, tmp_path, "--image-topic", "camera", "--require-arm", "--resume", "arm", "--joystick-lock")
+    assert said.strip() == 'standing ["the chair\'s joystick is not locked"] []'
+
+
+def test_policy_whose_steps_come_one_upon_the_other_still_reports_its_status(tmp_path):
+    assert run(FAST, tmp_path, "--image-topic", "camera").strip() == "3"

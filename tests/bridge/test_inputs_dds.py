@@ -48,6 +48,20 @@ def test_pulled_emergency_stop_ends_the_drive_until_it_is_released_and_armed(gra
     robot.wait_for_status(driving=True)
 
 
+def test_collision_that_a_best_effort_sensor_reports_stops_the_drive(graph, policy):
+    from bridge import ros
+
+    robot = graph.peer("robot")
+    robot.whole()
+    bumper = robot.publisher("std_msgs/Bool", "collision_sensor", ros.best_effort())
+    graph.start("drive", policy)
+    robot.wait_for_status(driving=True)
+    robot.wait_until(lambda _: bumper.get_subscription_count())
+    robot.repeat(bumper, 0.1, lambda: message_type("std_msgs/Bool")(data=True))
+    robot.wait_for_status(state="disarmed", reason="collision")
+    robot.wait_until(lambda robot: robot.commands[-1][1:] == (0.0, 0.0))
+
+
 def test_emergency_stop_that_falls_silent_while_driving_stops_and_needs_arming(graph, policy):
     robot = graph.peer("robot")
     beat = robot.whole()

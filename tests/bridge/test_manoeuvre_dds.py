@@ -70,6 +70,19 @@ def test_a_drive_that_a_person_ends_is_put_aside_and_no_trial(graph, commands):
     assert json.dumps(str(aside))[1:-1] in graph.log("manoeuvre")
 
 
+def test_a_drive_that_the_operator_interrupts_is_put_aside_and_cannot_be_recovered_as_a_trial(graph, commands):
+    commands.write_text("t,v,omega\n0,0.2,0\n60,0,0\n")
+    graph.start("simulate", "--simulator", "point_robot:RovingRobot", "--wait", 0)
+    logs = commands.parent / "logs"
+    graph.start("manoeuvre", commands, "--space", 20, 4, "--dataset", logs)
+    robot = graph.peer("operator")
+    arm_again_and_again(robot)
+    robot.wait_until(lambda _: any(path.read_text().count("\n") > 2 for path in logs.glob(".ahead_1.*/command.csv")))
+    assert graph.end("manoeuvre", signal.SIGINT) == 3, graph.log("manoeuvre")
+    assert not list(logs.glob("trials/*")) and not list(logs.glob(".*.partial-*"))
+    assert all(rows(aside / "command.csv") for aside in (logs / "aborted").iterdir())
+
+
 def test_a_trial_that_exists_is_refused_before_anything_moves(graph, commands):
     (commands.parent / "logs" / "trials" / "ahead_2").mkdir(parents=True)
     graph.start("manoeuvre", commands, "--space", 6, 4, "--dataset", commands.parent / "logs", "--repeat", 2)

@@ -1,9 +1,11 @@
 """ROS parameters become options of the command line, which wins over them."""
 
+import importlib
+
 import pytest
 
 from bridge.drive import parse_arguments
-from bridge.parameters import with_options
+from bridge.parameters import command_line, with_options
 
 pytest.importorskip("yaml")
 pytestmark = pytest.mark.quick
@@ -50,6 +52,68 @@ def test_file_that_is_no_parameter_file_is_refused_by_name(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)
     with pytest.raises(ValueError, match="YAML|bad.yaml"):
         options(["--ros-args", "--params-file", str(tmp_path / "bad.yaml")])
+
+
+TWO = """
+/left/bridge_drive: {ros__parameters: {v_limits: [-0.1, 0.1]}}
+/right:
+  bridge_drive: {ros__parameters: {v_limits: [-0.2, 0.2]}}
+/far/*: {ros__parameters: {v_limits: [-0.3, 0.3]}}
+"""
+
+
+@pytest.mark.parametrize("namespace, limit", [("/left", 0.1), ("/right", 0.2), ("right/", 0.2), ("/far", 0.3)])
+def test_each_of_several_chairs_gets_the_parameters_of_its_namespace(tmp_path, namespace, limit):
+    (tmp_path / "two.yaml").write_text(TWO)
+    parsed = options(["--ros-args", "-r", f"__ns:={namespace}", "--params-file", str(tmp_path / "two.yaml")], "runs/a")
+    assert parsed.v_limits == [-limit, limit]
+
+
+@pytest.mark.parametrize("names", [(), ("-r", "__ns:=/middle"), ("-r", "__ns:=/left", "-r", "__node:=other")])
+def test_file_without_a_section_for_the_node_is_refused_by_name(tmp_path, names):
+    (tmp_path / "two.yaml").write_text(TWO)
+    with pytest.raises(ValueError, match=r"two.yaml: has no section for the node .*/left/bridge_drive, /right/bridge"):
+        options(["--ros-args", *names, "--params-file", str(tmp_path / "two.yaml")], "runs/a")
+
+
+def test_file_whose_table_contains_itself_is_refused(tmp_path):
+    (tmp_path / "endless.yaml").write_text("a: &a {b: *a, c: *a}")
+    with pytest.raises(ValueError, match=r"endless.yaml: holds more than"):
+        options(["--ros-args", "--params-file", str(tmp_path / "endless.yaml")], "runs/a")
+
+
+def test_renamed_node_has_the_section_of_its_name_and_parameters_of_others_are_left_alone(tmp_path):
+    (tmp_path / "one.yaml").write_text("chair_1: {ros__parameters: {e_stop: watch}}")
+    ros = ["--ros-args", "-r", "__node:=chair_1", "--params-file", str(tmp_path / "one.yaml"),
+           "-p", "other:base:=generic", "-p", "chair_1:blind:=stop"]
+    parsed = options(ros, "runs/a")
+    assert (parsed.e_stop, parsed.base, parsed.blind) == ("watch", "whill", "stop")
+
+
+@pytest.mark.parametrize("name, parameter, option, value", [
+    ("guard", "command_topic:=base/cmd_vel", "command_topic", "base/cmd_vel"),
+    ("chair", "wheel_radius:=0.13", "wheel_radius", 0.13),
+    ("chair_joy", "full:=[0.5, 0.4, 0.8]", "full", [0.5, 0.4, 0.8]),
+    ("record", "odometry_topic:=odom", "odometry_topic", "odom"),
+    ("simulate", "seed:=4", "seed", 4),
+])
+def test_each_command_takes_its_parameters(name, parameter, option, value):
+    command = importlib.import_module(f"bridge.{name}")
+    words = ["logs", "one"] if name == "record" else []
+    own, _ = command_line([*words, "--ros-args", "-r", "__ns:=/left", "-p", parameter, "-p", "use_sim_time:=false"],
+                          f"bridge.{name}")
+    assert getattr(command.parse_arguments(own), option) == value
+    with pytest.raises(SystemExit):  # and none in silence
+        command.main([*words, "--ros-args", "-p", "no_such_option:=1"])
+
+
+def test_command_without_a_section_in_its_parameter_file_says_so(tmp_path, capsys):
+    from bridge.chair import main
+
+    (tmp_path / "one.yaml").write_text("bridge_drive: {ros__parameters: {e_stop: watch}}")
+    with pytest.raises(SystemExit) as ended:
+        main(["--ros-args", "--params-file", str(tmp_path / "one.yaml")])
+    assert ended.value.code == 1 and "no section for the node /bridge_chair" in capsys.readouterr().err
 
 
 def test_missing_parameter_file_is_named(tmp_path):

@@ -1,12 +1,14 @@
 """A manoeuvre through the safety state machine, with made-up times."""
 
 import math
+import os
+import sys
 
 import numpy as np
 import pytest
 
 from bridge.command_table import make_table
-from bridge.manoeuvre import BACK, FINISHED, Player
+from bridge.manoeuvre import BACK, FINISHED, Player, _enter_was_pressed
 from bridge.safety import SafetyConfig
 from bridge.vehicle_time import VehicleTime
 
@@ -119,6 +121,28 @@ def test_in_simulated_time_the_table_follows_the_clock():
     times = [t for t, _, _ in drive.moving()]
     assert drive.player.finished and times[-1] - times[0] == pytest.approx(0.5, abs=0.02)
     assert np.all(np.diff(times) < 0.02)
+
+
+def test_a_simulation_that_begins_again_at_zero_can_be_driven_at_once():
+    drive = simulated(1.0)
+    drive.run(60, dt=0.05)
+    drive.began = drive.now
+    drive.player.supervisor.clock_jump()
+    drive.player.supervisor.arm()
+    drive.run(6)
+    assert drive.player.finished
+
+
+@pytest.mark.parametrize("typed, pressed", [("\n", True), ("\x04", False), ("no\n", False), ("", False)])
+def test_only_enter_alone_arms_and_not_the_end_of_the_input(typed, pressed, monkeypatch):
+    master, slave = os.openpty()
+    with open(slave, encoding="utf-8") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        assert not _enter_was_pressed()  # it is not the terminal of this session
+        monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+        os.write(master, typed.encode())
+        assert _enter_was_pressed() == pressed
+    os.close(master)
 
 
 def test_a_simulation_that_waits_for_its_driver_stops_no_manoeuvre():

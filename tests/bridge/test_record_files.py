@@ -4,6 +4,7 @@ import argparse
 import csv
 import math
 import os
+import shutil
 import tomllib
 
 import pytest
@@ -131,6 +132,17 @@ def test_values_that_are_not_finite_are_left_out(tmp_path):
     assert len(read(writer.close() / "command.csv")) == 1
 
 
+def test_recordings_that_are_put_aside_never_replace_one_another(tmp_path):
+    def aside():
+        writer = TrialWriter(tmp_path, "circle_1")
+        writer.odometry(1.0, (0, 0, 0), (0, 0))
+        return writer.put_aside()
+
+    first, second = aside(), aside()
+    shutil.rmtree(first)
+    assert len({second, aside(), aside()}) == 3 and second.exists()
+
+
 def test_recording_never_replaces_a_trial(tmp_path):
     TrialWriter(tmp_path, "a").close()
     with pytest.raises(ValueError, match="exists already"):
@@ -205,6 +217,16 @@ def test_recording_of_a_killed_recorder_is_recovered_without_its_torn_row(tmp_pa
     assert "recovered" in capsys.readouterr().err
     gone.mkdir()
     assert main(["--recover", str(tmp_path)]) == Exit.FAULT and "exists already" in capsys.readouterr().err
+
+
+def test_recording_that_may_still_be_written_is_left_alone_and_named(tmp_path, capsys):
+    TrialWriter(tmp_path, "killed_1")
+    assert main(["--recover", str(tmp_path)]) == 0
+    said = capsys.readouterr().err
+    assert f"partial-{os.getpid()}: left alone, because a process {os.getpid()} runs" in said
+    assert "no recording" not in said
+    with pytest.raises(ValueError, match=r"is a recording that was killed. Make a trial of it with --recover"):
+        TrialWriter(tmp_path, "killed_1")  # by a process of the same number, as in a container
 
 
 def test_yaw_rate_of_an_imu_is_kept_with_its_stamps(tmp_path):

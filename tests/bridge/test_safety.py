@@ -76,6 +76,15 @@ def test_non_finite_action_is_zero_in_the_same_tick_and_resets_the_policy(bad):
     assert [speeds(drive.frame()) for _ in range(3)] == [(0, 0), (0, 0), (0.4, 0.2)]
 
 
+@pytest.mark.parametrize("elapsed, driven", [(0.06, True), (0.3, False)])
+def test_action_is_not_sent_where_its_frame_has_grown_too_old_meanwhile(elapsed, driven):
+    drive = Drive()
+    drive.now += 0.1
+    assert drive.supervisor.frame(drive.now, drive.now, 99) == "fresh"
+    command = drive.supervisor.action(drive.now, GO, elapsed)
+    assert (speeds(command), command.reason) == (((0.4, 0.2), "") if driven else ((0, 0), "frame age"))
+
+
 def test_three_non_finite_actions_in_ten_seconds_latch_until_rearmed():
     drive = Drive()
     for _ in range(3):

@@ -137,6 +137,7 @@ def test_each_sensor_that_falls_silent_stops_the_vehicle_by_its_own_limit_and_is
 
 def test_nothing_moves_before_each_sensor_has_spoken(trained):
     drive = Drive(trained)
+    assert drive.holds == ["no lidar", "no odometry", "no rear"]
     for _ in range(6):
         drive.period(without=["lidar"])
         drive.tick()

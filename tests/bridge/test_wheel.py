@@ -1,9 +1,11 @@
 """The robot's own wheel holds all that the robot needs and nothing of the training."""
 
 import configparser
+import runpy
 import shutil
 import subprocess
 import sys
+import types
 import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
@@ -108,3 +110,46 @@ def test_launch_file_names_programs_of_the_package_and_topics_of_the_node(name):
     text = (ROOT / "bridge" / "launch" / f"{name}.launch.py").read_text(encoding="utf-8")
     compile(text, name, "exec")
     assert 'package="whill_bridge", executable="bridge_drive"' in text and f'"{ros.COMMAND_TOPIC}"' in text
+
+
+def test_service_starts_again_after_a_crash_and_writes_where_its_user_may():
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str
+    unit.read(ROOT / "bridge" / "systemd" / "whill-bridge.service")
+    service = unit["Service"]
+    assert service["Restart"] == "always"  # `ros2 launch` ends with 0 when a node of it has died
+    assert not [value for value in service.values() if "%h" in value]  # the home of root, whatever User says
+
+
+def test_every_command_of_the_package_is_a_program_of_both_wheels():
+    import tomllib
+
+    from bridge.__main__ import COMMANDS
+
+    config = configparser.ConfigParser()
+    config.read(ROOT / "bridge" / "setup.cfg")
+    own = config["options.entry_points"]["console_scripts"]
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
+    for name in COMMANDS:
+        assert f"bridge_{name} = bridge.{name}:main" in own.splitlines()
+        assert scripts[f"bridge-{name.replace('_', '-')}"] == f"bridge.{name}:main"
+
+
+def test_launch_file_leaves_the_dds_profile_that_the_user_chose(monkeypatch):
+    def recorded(kind):
+        return lambda *words, **options: (kind, *words, options)
+
+    modules = {"launch": ["LaunchDescription"], "launch.actions": ["DeclareLaunchArgument", "SetEnvironmentVariable"],
+               "launch.substitutions": ["EnvironmentVariable", "LaunchConfiguration"], "launch_ros": [],
+               "launch_ros.actions": ["Node"], "ament_index_python": [], "ament_index_python.packages": []}
+    for name, kinds in modules.items():
+        module = types.ModuleType(name)
+        module.get_package_share_directory = lambda package: "/share"
+        vars(module).update({kind: recorded(kind) for kind in kinds})
+        monkeypatch.setitem(sys.modules, name, module)
+    launch = runpy.run_path(str(ROOT / "bridge" / "launch" / "drive.launch.py"))
+    _, actions, _ = launch["generate_launch_description"]()
+    (chosen,) = [action for action in actions if action[0] == "SetEnvironmentVariable"]
+    variable = "FASTRTPS_DEFAULT_PROFILES_FILE"
+    own = ("EnvironmentVariable", variable, {"default_value": "/share/fastdds.xml"})  # what is set wins
+    assert chosen == ("SetEnvironmentVariable", variable, own, {})

@@ -69,6 +69,20 @@ def test_odometry_follows_the_chair_through_every_wrap_also_at_the_drivers_slow_
     assert odometry.gaps == 0 and (pose.v, pose.omega) == (0.0, 0.0)
 
 
+def test_state_that_was_held_up_and_comes_with_the_next_one_makes_no_speed_of_its_own():
+    chair, odometry = FakeChair(), WheelOdometry()
+    speeds = []
+    for i in range(400):
+        chair.command(0.5, 0.0)
+        for _ in range(4):
+            chair.advance(0.005)
+        held_up = 0.0199 if i % 10 == 3 else 0.0
+        pose = odometry.update(chair.now + held_up, chair.state())
+        speeds.append(pose.v)
+    assert max(speeds) < 0.55 and min(speeds[100:]) > 0.2 and sorted(speeds)[200] == pytest.approx(0.5, abs=0.01)
+    assert abs(pose.x - chair.x) < 0.01
+
+
 def test_odometry_of_a_long_gap_keeps_the_pose_and_counts_it():
     odometry = WheelOdometry()
     odometry.update(0.0, ChairState())
