@@ -21,7 +21,6 @@ import jax.numpy as jnp
 from benchmarks.harness import device_name, figure, record, time_calls
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import RICH, Env, State, make_env, reset_state
-from whill_mjx.evaluation.novelty import SETTLED
 from whill_mjx.io import command_line
 from whill_mjx.io.reading import read_lines
 from whill_mjx.vehicle.kinematics import camera_pose
@@ -127,7 +126,7 @@ def foreign(options: Options) -> dict[str, dict[str, Any]]:
     for one in drives:
         groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
         if one["driver"] == "policy" and one["policy"] in stops:
-            surprised = max(one["novelty"][SETTLED:], default=0.0) >= stops[one["policy"]]
+            surprised = max(one["novelty"], default=0.0) >= stops[one["policy"]]
             end = "stopped" if surprised else one["end"]
             groups.setdefault((one["policy"], "with_stop", one["variant"]), []).append(end)
     found: dict[str, dict[str, Any]] = {}

@@ -32,8 +32,9 @@ from dreamer.spaces import ActionSpec, Discrete, ObsShape
 from dreamer.types import Params
 
 SINGLE = AgentContract.SINGLE
-CHECK_STEPS = 200  # recurrent steps on random observations over which ONNX and JAX are compared
 """Name of an observation that the environment does not name."""
+CHECK_STEPS = 200
+"""Recurrent steps on random observations over which ONNX and JAX are compared."""
 
 Step = Callable[[Carry, jax.Array], tuple[Carry, jax.Array]]
 

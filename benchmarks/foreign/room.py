@@ -226,8 +226,8 @@ def _unseen(xml: _Xml, random, start, carton_at) -> Room:
     for _ in range(int(random.integers(2, 7))):
         poster = xml.material(paint.letters(random, random.uniform(0, 1, 3), random.uniform(0, 1, 3)), uniform=False)
         side = int(random.choice([-1, 1]))
-        x, height, z, half = (random.uniform(*ends) for ends in ((-0.5, 6), (0.2, 0.45), (0.9, 1.7), (0.15, 0.5)))
-        xml.wall(side, (x, z), (half, height), 0.008, poster)
+        x, tall, z, wide = (random.uniform(*ends) for ends in ((-0.5, 6), (0.2, 0.45), (0.9, 1.7), (0.15, 0.5)))
+        xml.wall(side, (x, z), (wide, tall), 0.008, poster)
     size = (random.uniform(0.12, 0.3), random.uniform(0.12, 0.3), random.uniform(0.12, 0.4))
     yaw = random.uniform(-math.pi / 2, math.pi / 2)
     across = size[0] * abs(math.sin(yaw)) + size[1] * abs(math.cos(yaw))

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.evaluation.novelty import BELIEVED, RATE, SURPRISE, contradiction, limits, watched
+from whill_mjx.env import make_env
+from whill_mjx.evaluation.novelty import BELIEVED, RATE, SURPRISE, contradiction, largest_surprise, limits, watched
 
 pytestmark = pytest.mark.quick
 SECONDS = 0.1
@@ -55,10 +56,33 @@ def test_a_watched_policy_acts_as_before_and_carries_the_mean_jump():
     assert surprise[5] < surprise[4]
 
 
+def test_a_policy_that_is_surprised_by_its_first_frames_has_that_in_its_limits():
+    """The bridge compares each decision with the limits, the first ones too."""
+    env, params = make_env("open_room", height=8, width=8)
+
+    def act(weights, carry, image):
+        count = carry["count"] + 1
+        return {"count": count, SURPRISE: jnp.where(count == 2, weights, 0.1)[None]}, jnp.zeros(2)
+
+    carry = {"count": jnp.zeros((), jnp.int32), SURPRISE: jnp.zeros(1)}
+    largest, arrived = largest_surprise(env, params, act, 0.7, carry, jax.random.split(jax.random.key(0), 2))
+    np.testing.assert_allclose(largest, 0.7, rtol=1e-6)
+    assert not arrived.any()
+
+
 def test_limits_are_those_of_ordinary_episodes_and_rise():
-    slow, stop = limits(np.linspace(0.0, 1.0, 101))
+    slow, stop = limits(np.linspace(0.0, 1.0, 101), np.ones(101))
     assert (slow, stop) == pytest.approx((0.9, 0.99))
-    slow, stop = limits(np.full(5, 0.2))
+    slow, stop = limits(np.full(5, 0.2), np.ones(5))
+    assert 0 < slow < stop
+
+
+def test_drives_that_do_not_arrive_do_not_raise_the_limits():
+    """Where a policy fails in its own world it is surprised, and such a drive is one to stop."""
+    calm, lost = np.linspace(0.0, 1.0, 101), np.full(20, 9.0)
+    arrived = np.r_[np.ones(101), np.zeros(20)]
+    assert limits(np.r_[calm, lost], arrived) == pytest.approx((0.9, 0.99))
+    slow, stop = limits(lost, np.zeros(20))  # a policy that never arrives has limits all the same
     assert 0 < slow < stop
 
 

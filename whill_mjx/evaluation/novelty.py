@@ -20,10 +20,8 @@ SURPRISE, BELIEVED = "surprise", "believed"
 """Names of the carries (1,) and (4,) of a policy that is watched."""
 RATE = 0.1
 """Weight of the newest frame in the running mean: a second at 10 Hz."""
-SETTLED = 5
-"""Decisions after which the running mean no longer shows the first frame, which is new to every policy."""
 SLOW, STOP = 0.9, 0.99
-"""Shares of the episodes of its own world in which a policy is never slowed down, and never stopped."""
+"""Shares of the arrivals in its own world in which a policy is never slowed down, and never stopped."""
 
 
 def contradiction(before: jax.Array, now: jax.Array, seconds: float) -> jax.Array:
@@ -61,7 +59,7 @@ def watched(step: Callable, carry: dict[str, Any], seconds: float, believe: Call
 def largest_surprise(
     env: Env, params: Any, act: Callable, weights: Any, carry: dict[str, Any], keys: jax.Array
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Largest surprise of each episode (N,) [m], and whether it arrived (N,).
+    """Largest surprise of each episode (N,) [m], of all its decisions as the bridge sees them; whether it arrived (N,).
 
     Args:
         env, params: the policy's own world.
@@ -75,23 +73,27 @@ def largest_surprise(
     def one(weights: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         state, first = reset(env, params, key)
 
-        def decide(before, index):
+        def decide(before, _):
             state, memory, image, most, arrived = before
             memory, action = act(weights, memory, image)
-            now = jnp.where((index >= SETTLED) & ~state.done, jnp.mean(memory[SURPRISE]), 0.0)
+            now = jnp.where(state.done, 0.0, jnp.mean(memory[SURPRISE]))
             state, seen = step(env, params, state, action)
             arrived = jnp.maximum(arrived, seen.metrics["success"])
             return (state, memory, seen.obs, jnp.maximum(most, now), arrived), None
 
         start = (state, jax.tree.map(jnp.asarray, carry), first.obs, jnp.zeros(()), jnp.zeros(()))
-        last, _ = jax.lax.scan(decide, start, jnp.arange(length))
+        last, _ = jax.lax.scan(decide, start, length=length)
         return last[3], last[4]
 
     most, arrived = jax.jit(jax.vmap(one, in_axes=(None, 0)))(weights, keys)
     return np.asarray(most), np.asarray(arrived)
 
 
-def limits(largest: np.ndarray) -> tuple[float, float]:
-    """Surprise [m] from which a vehicle slows down, and at which it stands still."""
-    slow, stop = np.quantile(largest, [SLOW, STOP])
+def limits(largest: np.ndarray, arrived: np.ndarray) -> tuple[float, float]:
+    """Surprise [m] from which a vehicle slows down, and at which it stands still.
+
+    Drives that would not arrive are those to stop, so the limits are of the others. Where none arrived, all count.
+    """
+    good = np.asarray(arrived) > 0.5
+    slow, stop = np.quantile(largest[good] if good.any() else largest, [SLOW, STOP])
     return float(slow), float(max(stop, slow * 1.001))

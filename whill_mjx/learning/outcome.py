@@ -78,8 +78,8 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
     weights = jax.tree.map(jnp.asarray, result.params)
     if SURPRISE in carry:
         keys = episode_keys(NOVELTY_SEED + options.seed, NOVELTY_EPISODES)
-        largest, _ = largest_surprise(course.env, course.params, policy, weights, carry, keys)
-        contract = dataclasses.replace(contract, novelty=limits(largest))
+        surprises = largest_surprise(course.env, course.params, policy, weights, carry, keys)
+        contract = dataclasses.replace(contract, novelty=limits(*surprises))
     shown, step = obs_shape_of(course.env), partial(policy, weights)
     try:
         if isinstance(shown, dict):
