@@ -123,7 +123,8 @@ def test_the_progress_bar_tells_the_stage_and_does_not_run_over(sloping, stages)
 
 def test_a_fit_may_close_the_loop_with_the_same_references(folder, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr("sysid.fit.fit_dataset", lambda *_, **__: {"prior": None, "dataset": {"notes": []}})
+    monkeypatch.setattr("sysid.fit.fit_dataset", lambda *_, **__: {
+        "prior": None, "dataset": {"notes": []}, "summary": {"held_out": {}}})
     monkeypatch.setattr("sysid.fit.parameter_table", lambda _: "")
     monkeypatch.setattr("sysid.fit.table", lambda _: "")
     monkeypatch.setattr("sysid.verdict.pipeline.watched", lambda *given: given)

@@ -58,7 +58,7 @@ def test_a_watched_policy_acts_as_before_and_carries_the_mean_jump():
 
 def test_a_policy_that_is_surprised_by_its_first_frames_has_that_in_its_limits():
     """The bridge compares each decision with the limits, the first ones too."""
-    env, params = make_env("open_room", height=8, width=8)
+    env, params = make_env("point_goal", height=8, width=8)
 
     def act(weights, carry, image):
         count = carry["count"] + 1
