@@ -121,7 +121,7 @@ def test_the_progress_bar_tells_the_stage_and_does_not_run_over(sloping, stages)
     assert sum(steps for steps, _ in stages) <= expected_steps(CONFIG, 2)
 
 
-def test_a_fit_may_close_the_loop_with_the_same_references(folder, tmp_path, monkeypatch):
+def test_a_fit_may_close_the_loop_with_the_same_references(folder, drives, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr("sysid.fit.fit_dataset", lambda *_, **__: {
         "prior": None, "dataset": {"notes": []}, "summary": {"held_out": {}}})
