@@ -75,20 +75,33 @@ def by_their_units(c):
             "odom heading [deg/s]": np.rad2deg(c["w"])}
 
 
-@pytest.mark.parametrize("form", [german, by_their_units])
-def test_the_unit_says_whether_a_turn_is_a_heading_or_a_rate(tmp_path, form):
+def without_the_second(c):
+    return {"time": c["t"], "cmd v [m/s]": c["cv"], "cmd_yaw_rate_deg": np.rad2deg(c["cw"]), "odom_x": c["x"],
+            "odom_y": c["y"], "odom_yaw_rads": c["yaw"], "odom v [m/s]": c["v"], "gyro z [deg]": np.rad2deg(c["w"])}
+
+
+def turn_beside_a_heading(c):
+    return {"time": c["t"], "cmd v [m/s]": c["cv"], "cmd_turn_rad": c["cw"], "odom x [m]": c["x"], "odom y [m]": c["y"],
+            "odom heading [degs]": np.rad2deg(c["yaw"]), "odom v [m/s]": c["v"], "odom turn [deg]": np.rad2deg(c["w"]),
+            "gt x": c["gx"], "gt y": c["gy"], "gt turn [deg]": np.rad2deg(c["gyaw"])}
+
+
+@pytest.mark.parametrize("form", [german, by_their_units, without_the_second, turn_beside_a_heading])
+def test_the_unit_says_whether_a_turn_is_a_heading_or_a_rate_unless_the_name_does(tmp_path, form):
     convert(ConvertConfig(write(tmp_path / "drive.csv", form(columns())), tmp_path / "data"))
     trial = load_log(tmp_path / "data").trials[0]
     check(trial)
     held = np.searchsorted(trial.command.t, 10.0, side="right") - 1
     assert trial.command.omega[held] == pytest.approx(DRIVE.command.omega[100], abs=1e-3)
+    assert (trial.ground_truth is not None) == (form is turn_beside_a_heading)
 
 
 def test_a_vehicle_that_turns_without_a_commanded_yaw_rate_is_refused_with_the_unused_columns(tmp_path):
     table = without_units(columns())
     renamed = {("steer demand" if name == "cmd_w" else name): values for name, values in table.items()}
     path = write(tmp_path / "drive.csv", renamed)
-    with pytest.raises(ValueError, match="no column is the commanded yaw rate.*not used: drive/steer demand"):
+    with pytest.raises(ValueError, match="no column is the commanded yaw rate.*not used: drive/steer demand. If none "
+                                         "was commanded, add a column of zeros for it"):
         convert(ConvertConfig(path, tmp_path / "data"))
     convert(ConvertConfig(path, tmp_path / "data", columns=("command.omega=steer demand:rad/s",)))
     assert np.ptp(load_log(tmp_path / "data").trials[0].command.omega) > 0.5

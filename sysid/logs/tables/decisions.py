@@ -131,7 +131,7 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
                 "to it.")
     if _has(roles, "command", "v") and "command.omega" not in roles and (turn := _turned(columns, arrays)) > TURNED:
         return (f"no column is the commanded yaw rate, though the vehicle turns by {turn:.2g} rad: "
-                f"{_unused(tables, columns)}. Without one, no turn counts as commanded.")
+                f"{_unused(tables, columns)}. If none was commanded, add a column of zeros for it.")
     inputs = _has(roles, "command", "v", "omega") or _has(roles, "command", "left", "right") or _wheels(roles)
     measured = _has(roles, "ground_truth", "x", "y") or _has(roles, "odometry", "v", "omega") or _has(
         roles, "odometry", "x", "y")
@@ -169,7 +169,7 @@ def _unused(tables: Sequence[Table], columns: Sequence[Column]) -> str:
     """The columns without a role, as a clause."""
     used = {(one.file, one.name) for one in columns}
     names = [f"{table.stem}/{name}" for table in tables for name in table.columns if (table.stem, name) not in used]
-    return f"not used: {', '.join(names[:NAMED])}" if names else "all columns are used"
+    return f"not used: {first_of(names)}" if names else "all columns are used"
 
 
 def _has(roles: set[str], stream: str, *quantities: str) -> bool:

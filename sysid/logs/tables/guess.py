@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.logs.tables.columns import SAID, Column, Table
-from sysid.logs.tables.names import STREAM_WORDS, by_name, says_stream, words_of
+from sysid.logs.tables.columns import SAID, STREAMS, Column, Table
+from sysid.logs.tables.names import STREAM_WORDS, by_name, may_be_heading, says_stream, words_of
 from sysid.logs.tables.sizes import with_time_unit, with_units
 
 NEAR = 0.02  # of any unit from 0, at which an odometry begins
@@ -33,6 +33,7 @@ def guess(
         roles = {one.role for one in found if one.role != "time"}
         candidates = [column for name in table.columns if (table.stem, name) not in taken
                       and (column := by_name(table, name)) is not None and column.role not in settled]
+        candidates = _with_headings(candidates, roles)
         long_unit = {"min", "h", "d"}  # a column of hours may stand beside the time itself
         for column in sorted(candidates, key=lambda one: (not one.sure, one.role == "time" and one.unit in long_unit)):
             rival = column.role == "time" and any(one.role == "time" and one.file == table.stem for one in found)
@@ -48,7 +49,16 @@ def guess(
         return decided
     open_ones = {(one.role, one.name) for one in decided if one.assumed and (one.role, one.name) in units}
     return with_units([replace(one, unit=units[one.role, one.name], why=f"{one.why}; as most drives show")
-                              if (one.role, one.name) in open_ones else one for one in found], arrays)
+                       if (one.role, one.name) in open_ones else one for one in found], arrays)
+
+
+def _with_headings(candidates: Sequence[Column], roles: set[str]) -> list[Column]:
+    """Turns that may be headings are those of streams with a place and no other heading."""
+    known = roles | {one.role for one in candidates}
+    lacking = {stream for stream in STREAMS if f"{stream}.x" in known and not {f"{stream}.yaw", f"{stream}.qw"} & known}
+    return [replace(one, role=f"{stream}.yaw") if quantity == "omega" and stream in lacking
+            and may_be_heading(one.name, one.unit) else one
+            for one in candidates for stream, _, quantity in [one.role.partition(".")]]
 
 
 def _settled_commands(said: set[str]) -> set[str]:

@@ -31,8 +31,10 @@ QUANTITY_WORDS = {
           "geschwindigkeit", "geschw"),
     "x": ("x", "px", "posx", "tx", "easting", "east"), "y": ("y", "py", "posy", "ty", "northing", "north"),
 }
-OF_TURNS = {"yaw": "angle", "omega": "rate"}
-"""What a turn may be called by either name, and the kind of unit that says which it is."""
+TURNS, RATES = {"turn", "rot", "ang"}, {"rate", "vel", "velocity", "speed", "dot"}
+"""Words for a heading or its rate, and those that say a rate beside them."""
+PLURALS = {"rads", "degs"}
+"""Units of headings too, though of rates they are rad/s and deg/s."""
 TICKS = re.compile(r"tick|count|enc(oder)?s?([ _]|$)", re.IGNORECASE)
 """In the names of wheel angles that an encoder counts."""
 COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)  # in the names of columns that count rows
@@ -67,9 +69,11 @@ def by_name(table: Table, name: str) -> Column | None:
     quantity = _quantity([word for word in words if word not in stream_words] or words)
     if quantity is None:
         return None
-    if quantity in OF_TURNS:  # a yaw in deg/s is a yaw rate, a turn in deg is a heading
-        quantity = next((one for one, kind in OF_TURNS.items() if unit in UNITS[kind]), quantity)
+    if quantity == "yaw" and unit in UNITS["rate"] and not PLURALS & set(words_of(name)):
+        quantity = "omega"
     stream, sure = _stream_named(words, words_of(table.stem), quantity, table)
+    if quantity == "omega" and stream == "ground_truth" and may_be_heading(name, unit):  # it has no rates
+        quantity = "yaw"
     if stream is None or quantity not in QUANTITIES[stream]:
         return None
     if quantity in ("left", "right", "left_angle", "right_angle") and not unit and TICKS.search(name) \
@@ -170,6 +174,13 @@ def split_unit(name: str) -> tuple[str, str]:
             match[1].lower() not in SPELLED and match[1].lower() != "rpm" else match[1]
         return name[: match.start()], unit_of(unit.replace("/sec", "/s"))
     return name, ""
+
+
+def may_be_heading(name: str, unit: str) -> bool:
+    """Whether what is a yaw rate by its name is a heading by its unit: a turn in degrees. Where a name says a rate, as
+    `yaw_rate_deg`, people left the second out."""
+    words = set(words_of(name))
+    return unit in UNITS["angle"] and bool(words & TURNS) and not words & RATES
 
 
 def with_unit(name: str, unit: str) -> str:
