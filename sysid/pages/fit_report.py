@@ -247,7 +247,7 @@ def effective_track(drives: Sequence[Prediction | Trial], track: float, scale: f
         yaw, wheels = yaw - yaw.mean(), odometry.yaw - np.mean(odometry.yaw)
         along, turned = along + float(yaw @ wheels), turned + float(yaw @ yaw)
         samples += len(yaw)
-    if turned <= samples * TURNS**2:
+    if not (turned > samples * TURNS**2 and np.isfinite(along)):  # a replay that diverged is no number
         return None
     return along / turned * track / scale
 

@@ -8,7 +8,9 @@ import pytest
 from benchmarks.plant.first_day import Day, Wrong, make_uncalibrated
 from benchmarks.plant.skid import CRAWLER, SKIDS, write_skid_urdf
 from sysid.logs.log import load_log
+from sysid.logs.records import OdometryStream, PoseStream, Prediction
 from sysid.pages.fit_page import headline, warning
+from sysid.pages.fit_report import effective_track
 from sysid.replay.mjcf import mjcf_model
 from sysid.replay.model_files import steps_mjx
 from sysid.search.fitting import fit_log, make_problem, predict, subject
@@ -105,3 +107,11 @@ def test_a_fit_that_is_worse_on_held_out_drives_says_so_first(worse):
                                     {"summary": {"held_out": {}, "training": {}}}])
 def test_a_fit_that_is_better_or_within_the_spread_of_replicates_is_no_worse(better):
     assert warning(better) == ""
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("turns", "track"), [(1.0, 0.75), (0.0, None), (np.nan, None)])
+def test_the_effective_track_is_of_drives_that_turn_and_did_not_diverge(turns, track):
+    t = np.linspace(0.0, 10.0, 101)
+    outside, wheels = PoseStream(t, t, 0 * t, turns * 0.2 * t), OdometryStream(t, t, 0 * t, turns * 0.3 * t, t, 0 * t)
+    assert effective_track([Prediction(outside, wheels)], 0.5) == (None if track is None else pytest.approx(track))
