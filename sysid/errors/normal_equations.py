@@ -30,7 +30,7 @@ _COMPILERS = ThreadPoolExecutor(10)  # as many functions as a search has
 
 
 class Traceable(Protocol):
-    """`sysid.errors.pose_objective.Objective` or `sysid.search.starts.FeatureObjective`."""
+    """`sysid.errors.pose_objective.Objective` or `sysid.errors.bin_objective.FeatureObjective`."""
 
     @property
     def space(self) -> Space: ...

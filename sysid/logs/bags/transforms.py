@@ -186,7 +186,7 @@ def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
             moved = -_rotated(turned, moved)
         place, turn = place + _rotated(turn, moved), _product(turn, turned)
     x, y, z, w = turn.T
-    return Chained(links.topics[0], parent, child, clock[kept, 0], clock[kept, 1], 
+    return Chained(links.topics[0], parent, child, clock[kept, 0], clock[kept, 1],
                    np.column_stack([place[:, :2], yaw_of(w, x, y, z)]))
 
 
