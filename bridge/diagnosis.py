@@ -271,7 +271,7 @@ def _command_causes(evidence: Evidence) -> list[str]:
         found.append(f"the base on {topic} listens to {', '.join(sorted(types))}, {sent}: give --command-type auto")
     elif types and not any(one.hears for one in evidence.listeners if TYPES.get(one.type) == evidence.command_type):
         found.append(f"the base on {topic} asks for a quality of service that commands (reliable, volatile, without a "
-                     "deadline) do not offer: change its subscription")
+                     "deadline or a lease) do not offer: change its subscription")
     if evidence.commanders:
         found.append(f"{topic} has other publishers: {', '.join(evidence.commanders)}; stop them, or put twist_mux "
                      "between")

@@ -41,12 +41,20 @@ def command_line(arguments: list[str] | None, program: str, positional: str = ""
 
 
 def with_options(ros_arguments: list[str], node: str, positional: str, own: list[str]) -> list[str]:
-    """Return the words of the command line, and before them the ROS parameters that they do not give themselves.
+    """Return the words of the command line, and with them the ROS parameters that they do not give themselves.
+
+    An option of several values takes all words up to the next option, so own words never follow a parameter's.
 
     Args and Raises: as of `as_options`; `own` are the words.
     """
     given = {word.partition("=")[0] for word in own if word.startswith("--")}
-    return as_options(ros_arguments, node, positional, given) + own
+    words = as_options(ros_arguments, node, positional, given)
+    first = [word for word in words[:1] if not word.startswith("--")]  # the positional one
+    options = words[len(first):]
+    if own and not own[0].startswith("-"):
+        first = []  # the command line has its own
+    end = own.index("--") if "--" in own else len(own)
+    return first + own[:end] + options + own[end:]
 
 
 def as_options(ros_arguments: list[str], node: str, positional: str = "", given: Collection[str] = ()) -> list[str]:

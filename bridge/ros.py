@@ -43,7 +43,7 @@ GUARD_NAME = "bridge_guard"
 RECORD_NAME = "bridge_record"
 MANOEUVRE_NAME = "bridge_manoeuvre"
 ENDLESS = 10**18
-"""Nanoseconds from which a deadline is none: DDS has 2^63 - 1 for it."""
+"""Nanoseconds from which a deadline or a lease is none: DDS has 2^63 - 1 for it."""
 PROFILE = Path(__file__).with_name("fastdds.xml")
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -160,10 +160,11 @@ def is_reliable(policy: Any) -> bool:
 def hears_commands(requested: Any) -> bool:
     """Return whether a subscriber's quality of service, as the graph gives it, lets it hear `reliable` commands.
 
-    They are not kept for late joiners, and promise no deadline. `qos_check_compatible` of rclpy takes the endless
-    deadline of the graph for one.
+    They are not kept for late joiners, and promise neither a deadline nor signs of life. `qos_check_compatible` of
+    rclpy takes the endless deadline of the graph for one.
     """
-    return not is_latched(requested.durability) and not 0 < requested.deadline.nanoseconds < ENDLESS
+    times = requested.deadline.nanoseconds, requested.liveliness_lease_duration.nanoseconds
+    return not is_latched(requested.durability) and not any(0 < one < ENDLESS for one in times)
 
 
 def is_latched(policy: Any) -> bool:

@@ -232,14 +232,14 @@ def _subject(
     intervals: dict[str, tuple[float, float]] = {}
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
+    elif model is None and log.fields.get("input") == "wheels":
+        model = wheel_model(log.spec)
     if model is not None and config.vehicle is not None:
         raise ValueError(f"{config.vehicle}: a vehicle file says nothing about the model {model.name!r}. Leave "
                          "--vehicle or --model out.")
     start, start_of_file = None, model is not None and model.instead is not None
     if model is not None and model.instead is not None:
         start, model = model.instead(log.spec).params, None
-    elif model is None and log.fields.get("input") == "wheels":
-        model = wheel_model(log.spec)
     if model is not None:
         alone: tuple[str, ...] = ()
         model = model.with_effects((*config.effects, *models.gyro_effects(trials)))

@@ -95,6 +95,7 @@ class QoSProfile:
     reliability: str = "RELIABLE"
     durability: str = "VOLATILE"
     deadline: Duration = Duration()
+    liveliness_lease_duration: Duration = Duration()
 
 
 class Policy:

@@ -1,6 +1,7 @@
 """ROS parameters become options of the command line, which wins over them."""
 
 import importlib
+from pathlib import Path
 
 import pytest
 
@@ -105,6 +106,21 @@ def test_each_command_takes_its_parameters(name, parameter, option, value):
     assert getattr(command.parse_arguments(own), option) == value
     with pytest.raises(SystemExit):  # and none in silence
         command.main([*words, "--ros-args", "-p", "no_such_option:=1"])
+
+
+@pytest.mark.parametrize("name, words, parameters, expected", [
+    ("record", ["logs", "one"], ["held_out:=[a_1, b_1]"], {"trial": "one", "held_out": ["a_1", "b_1"]}),
+    ("record", ["--seconds", "3", "--", "logs", "one"], ["held_out:=[a_1]"], {"trial": "one", "held_out": ["a_1"]}),
+    ("simulate", ["runs/a"], ["wheels:=[left, right]"], {"policy": Path("runs/a"), "wheels": ["left", "right"]}),
+    ("simulate", ["runs/a"], ["policy:=runs/b", "seed:=3"], {"policy": Path("runs/a"), "seed": 3}),
+    ("simulate", ["--seed", "3"], ["policy:=runs/b", "wheels:=[left, right]"], {"policy": Path("runs/b"), "seed": 3}),
+])
+def test_a_list_of_a_parameter_takes_no_word_of_the_command_line(name, words, parameters, expected):
+    command = importlib.import_module(f"bridge.{name}")
+    ros = [word for one in parameters for word in ("-p", one)]
+    own, _ = command_line([*words, "--ros-args", *ros], f"bridge.{name}", "policy" if name == "simulate" else "")
+    parsed = vars(command.parse_arguments(own))
+    assert {key: parsed[key] for key in expected} == expected
 
 
 def test_command_without_a_section_in_its_parameter_file_says_so(tmp_path, capsys):

@@ -18,7 +18,11 @@ from sysid.logs.log import load_log
 from sysid.logs.records import Command, with_timeout
 from sysid.logs.tables.text_table import read_table
 from sysid.replay.wheel_model import wheel_model
+from sysid.search.fitting import check_settings
+from sysid.search.settings import FitConfig
 from whill_mjx.io.fields import DATASET
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.vehicle_file import save_vehicle
 
 pytestmark = pytest.mark.quick
 CHAIR = {trial.name: trial for trial in load_log(Path(sysid.__file__).parent / "data" / "chair").trials}
@@ -499,17 +503,29 @@ def test_a_unit_that_is_left_out_of_a_flag_is_found_as_elsewhere(tmp_path):
     check(log.trials[0])
 
 
-def test_wheel_speeds_and_an_outside_pose_are_an_input_without_commands(tmp_path):
+def wheel_log(folder):
+    """Log and notes of a drive with measured wheel speeds and an outside pose, and the drive's columns."""
     c = columns()
     left, right = ((c["v"] + side * c["w"] * 0.496 / 2) / 0.1325 * 60 / (2 * np.pi) for side in (-1, 1))
-    path = write(tmp_path / "drive.csv", {"t": c["t"], "wheel_left_rpm": left, "wheel_right_rpm": right,
-                                          "mocap_x": c["gx"], "mocap_y": c["gy"], "mocap_yaw": c["gyaw"]})
-    log, notes = convert(ConvertConfig(path, tmp_path / "log"))
+    path = write(folder / "drive.csv", {"t": c["t"], "wheel_left_rpm": left, "wheel_right_rpm": right,
+                                        "mocap_x": c["gx"], "mocap_y": c["gy"], "mocap_yaw": c["gyaw"]})
+    return *convert(ConvertConfig(path, folder / "log")), c
+
+
+def test_wheel_speeds_and_an_outside_pose_are_an_input_without_commands(tmp_path):
+    log, notes, c = wheel_log(tmp_path)
     assert log.fields["input"] == "wheels" and log.trials[0].odometry is None
     assert any("no commands" in note for note in notes) and any("measured wheel speeds" in note for note in log.notes)
     np.testing.assert_allclose(log.trials[0].command.v, c["v"], atol=1e-3)
     assert log.trials[0].command.t[3] == pytest.approx((c["t"][2] + c["t"][3]) / 2)  # half an interval before
     assert set(wheel_model(log.spec).params.values) >= {"radius", "track", "ahead"}
+
+
+def test_a_vehicle_file_beside_measured_wheel_speeds_is_refused(tmp_path):
+    log, *_ = wheel_log(tmp_path)
+    file = save_vehicle(tmp_path / "vehicle.toml", log.spec, preset_params(log.spec, "physical"))
+    with pytest.raises(ValueError, match=r"vehicle.toml: a vehicle file says nothing about the model"):
+        check_settings(log, FitConfig(vehicle=file))
 
 
 @pytest.mark.parametrize("period", [0.05, 0.5])
