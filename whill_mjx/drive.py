@@ -1,6 +1,6 @@
-"""Drive manoeuvres with a simulated vehicle and write them as a driving-log dataset.
+r"""Drive manoeuvres with a simulated vehicle and write them as a driving-log dataset.
 
-    python -m whill_mjx.drive --manoeuvre figure_eight --vehicle whill_cr_physical
+    python -m whill_mjx.drive --manoeuvre figure_eight --vehicle whill_cr_physical \
         --effects command_delay:delay=0.2 yaw_scrub:torque=6 --replicates 3 --noise --out DATASET
 
 An effect is NAME, or NAME:PARAMETER=VALUE,...: a vehicle that has the effect gets the values given; any other gets the

@@ -32,7 +32,8 @@ class Compiled:
         leaves, structure = jax.tree.flatten(arrays)
         key = structure, static, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         with self._lock:
-            if key not in self._programs:
+            kept = self._programs.get(key)
+            if kept is None or (kept.done() and kept.exception()):  # what failed once is tried again
                 shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), arrays)
                 self._programs[key] = _COMPILERS.submit(self._compile, shapes, static)
             return self._programs[key]

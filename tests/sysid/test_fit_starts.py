@@ -188,3 +188,18 @@ def test_what_fails_while_it_is_compiled_fails_where_it_is_needed():
     with pytest.raises(ValueError, match="no such thing"):
         function(np.ones(2))
     assert isinstance(program.exception(), ValueError)
+
+
+def test_what_failed_to_compile_once_is_tried_again():
+    tries = []
+
+    def scarce(x):
+        tries.append(x.shape)
+        if len(tries) == 1:
+            raise MemoryError
+        return 2 * x
+
+    function = Compiled(scarce)
+    with pytest.raises(MemoryError):
+        function(np.ones(2))
+    np.testing.assert_array_equal(function(np.ones(2)), 2 * np.ones(2))
