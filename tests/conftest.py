@@ -32,6 +32,17 @@ QUICK_TO_COMPILE = ("dreamer", "whill_mjx", "test_among.py", "test_calibration.p
 """Folders and files whose programs take far longer to compile than to run; most of `sysid` replay many long drives."""
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """With `--dist loadgroup` the tests of a file stay in one worker, and so do all those of real ROS nodes.
+
+    Domains keep nodes apart, but Fast DDS shares its first ports of shared memory between all domains of a host.
+    """
+    for item in items:
+        file = item.nodeid.partition("::")[0]
+        item.add_marker(pytest.mark.xdist_group("dds" if file.endswith("_dds.py") else file))
+
+
 def pytest_collection_finish():
     """What was imported stays: Python need not look through it for garbage, nor so often through what is traced."""
     gc.collect()
