@@ -33,6 +33,9 @@ def free_domain():
             return
 
 
+PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+LOOPBACK = Path(__file__).parent / "udp.xml"
+"""Profile of the processes: no shared memory, whose ports are those of the whole host."""
 WAIT = 120
 """Seconds after which a condition counts as one that never comes true; a machine that tests in parallel is slow."""
 SIGNAL_AGE = ("--signal-age", "20")
@@ -54,7 +57,7 @@ class Graph:
         self.leftovers = set()
         python_path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "bridge")])
         self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-                            "PYTHONPATH": python_path, "ROS_LOG_DIR": str(folder / "log")}
+                            "PYTHONPATH": python_path, "ROS_LOG_DIR": str(folder / "log"), PROFILE: str(LOOPBACK)}
 
     def start(self, name, *arguments, key=None):
         key = key or name

@@ -8,6 +8,7 @@ import sys
 import time
 
 import pytest
+from ros_graph import PROFILE
 
 from bridge.exits import Exit
 
@@ -81,6 +82,7 @@ def test_second_commander_makes_the_bridge_stand_and_name_it(graph, policy):
 
 
 def test_large_best_effort_images_arrive_with_the_shipped_profile(graph, policy, tmp_path):
+    del graph.environment[PROFILE]
     graph.start("drive", policy)
     graph.wait_for("drive", "standing")
     graph.start("simulate", "--simulator", "point_robot:PointRobot", "--episodes", 1, "--image-size", 720, 1280,
