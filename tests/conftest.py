@@ -34,13 +34,13 @@ QUICK_TO_COMPILE = ("dreamer", "whill_mjx", "test_among.py", "test_calibration.p
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """With `--dist loadgroup` the tests of a file stay in one worker, and so do all those of real ROS nodes.
+    """With `--dist loadgroup` the tests of a file stay in one worker, and so do all those of the bridge.
 
-    Domains keep nodes apart, but Fast DDS shares its first ports of shared memory between all domains of a host.
+    Domains should keep nodes apart, but Fast DDS shares its first ports of shared memory between all domains of a host.
     """
     for item in items:
         file = item.nodeid.partition("::")[0]
-        item.add_marker(pytest.mark.xdist_group("dds" if file.endswith("_dds.py") else file))
+        item.add_marker(pytest.mark.xdist_group("bridge" if "tests/bridge/" in file else file))
 
 
 def pytest_collection_finish():
