@@ -23,7 +23,7 @@ from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.effects.sensing import OdometryScale
 from benchmarks.plant.make import Result, write_dataset
 from benchmarks.plant.sensors import odometry, outside_pose
-from benchmarks.plant.skid import SKIDS, Skid, SkidPlant
+from benchmarks.plant.skid import SKIDS, Skid, SkidPlant, urdf_wheel
 from benchmarks.plant.trial import Noise, Plant
 from whill_mjx.logs.dataset import write_text
 
@@ -224,13 +224,8 @@ def write_urdf(path: Path, chair: Chair = SMALL) -> Path:
     ixx, iyy, izz = (frame * one**2 for one in chair.gyration)
     turned, rolled = (share * chair.wheel_mass * radius**2 for share in SPIN[:2])
     ball, ball_x = ball_of(chair)
-    wheels = "".join(
-        f'<link name="{side}_wheel"><inertial><mass value="{chair.wheel_mass}"/><inertia ixx="{turned:.6g}" ixy="0" '
-        f'ixz="0" iyy="{turned:.6g}" iyz="0" izz="{rolled:.6g}"/></inertial><collision><geometry>'
-        f'<cylinder radius="{radius}" length="{0.54 * radius}"/></geometry></collision></link>'
-        f'<joint name="{side}_wheel_joint" type="continuous">'
-        f'<parent link="base_link"/><child link="{side}_wheel"/><origin xyz="0 {sign * nominal.track / 2} {radius}" '
-        f'rpy="-1.5707963 0 0"/><axis xyz="0 0 1"/></joint>' for side, sign in (("left", 1), ("right", -1)))
+    wheels = "".join(urdf_wheel(side, (0, sign * nominal.track / 2, radius), 0.54 * radius, chair.wheel_mass,
+                                (turned, rolled)) for side, sign in (("left", 1), ("right", -1)))
     write_text(path, f"""<?xml version="1.0"?>
 <robot name="small_robot">
   <link name="base_link"><inertial><origin xyz="{chair.com[0]} 0 {radius + chair.com[2]}"/><mass value="{frame}"/>

@@ -141,19 +141,34 @@ class SkidPlant:
         data.qpos[:2], data.qpos[3:7] = start[:2], attitude
 
 
+def urdf_wheel(name: str, place: tuple[float, float, float], width: float, mass: float, inertia: tuple[float, float]
+               ) -> str:
+    """A driven wheel of a robot file: its link, and the joint to `base_link`.
+
+    Args:
+        name: with `_wheel` behind it the name of the link.
+        place: x, y, z of its centre in `base_link` [m]; z is its radius.
+        width: [m].
+        mass: [kg].
+        inertia: across its axle and about it [kg m2].
+    """
+    x, y, radius = place
+    across, about = inertia
+    return (f'<link name="{name}_wheel"><inertial><mass value="{mass}"/><inertia ixx="{across:.6g}" ixy="0" ixz="0" '
+            f'iyy="{across:.6g}" iyz="0" izz="{about:.6g}"/></inertial><collision><geometry>'
+            f'<cylinder radius="{radius}" length="{width}"/></geometry></collision></link>'
+            f'<joint name="{name}_wheel_joint" type="continuous"><parent link="base_link"/><child link="{name}_wheel"/>'
+            f'<origin xyz="{x} {y} {radius}" rpy="-1.5707963 0 0"/><axis xyz="0 0 1"/></joint>')
+
+
 def write_skid_urdf(path: Path, robot: Skid = HAULER) -> Path:
     """The robot file that its owner has: believed sizes, a box and cylinders."""
     nominal, radius = robot.nominal, robot.nominal.radius
     frame = robot.mass - 2 * len(robot.axles) * robot.wheel_mass
     ixx, iyy, izz = (frame * one**2 for one in robot.gyration)
     spin = SPIN * robot.wheel_mass * radius**2
-    wheels = "".join(
-        f'<link name="{name}_wheel"><inertial><mass value="{robot.wheel_mass}"/><inertia ixx="{0.6 * spin:.6g}" '
-        f'ixy="0" ixz="0" iyy="{0.6 * spin:.6g}" iyz="0" izz="{spin:.6g}"/></inertial><collision><geometry>'
-        f'<cylinder radius="{radius}" length="{2 * WIDTH * radius}"/></geometry></collision></link>'
-        f'<joint name="{name}_wheel_joint" type="continuous"><parent link="base_link"/><child link="{name}_wheel"/>'
-        f'<origin xyz="{x} {(1 - 2 * side) * nominal.track / 2} {radius}" rpy="-1.5707963 0 0"/><axis xyz="0 0 1"/>'
-        "</joint>" for name, side, x, _ in places(robot))
+    wheels = "".join(urdf_wheel(name, (x, (1 - 2 * side) * nominal.track / 2, radius), 2 * WIDTH * radius,
+                                robot.wheel_mass, (0.6 * spin, spin)) for name, side, x, _ in places(robot))
     write_text(path, f"""<?xml version="1.0"?>
 <robot name="skid_robot">
   <link name="base_link"><inertial><origin xyz="{robot.com[0]} 0 {radius + robot.com[2]}"/><mass value="{frame}"/>

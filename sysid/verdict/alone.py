@@ -61,9 +61,9 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
         as_good = [one for one, gains in standing if one is best or interval_of_sum(most - gains)[0] <= 0]
         alike = class_of(asked, best, candidates)
         shown = as_good if wheels else [
-            one for one in candidates
-            if card_of(one.hypothesis.effect).shown_by_pose and (one in as_good or one.hypothesis.effect in alike)
-            and interval_of_sum(held_back(asked, one.refit))[0] > 0]
+            one for one in candidates if card_of(one.hypothesis.effect).shown_by_pose
+            and (any(one is good for good in as_good)
+                 or one.hypothesis.effect in alike and interval_of_sum(held_back(asked, one.refit))[0] > 0)]
         if not shown:
             unseen = unseen or best.hypothesis.effect
             hidden += best.share - asked.explained(found.final)  # what has no name is no part of what names explain
