@@ -155,16 +155,8 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
             if odd and abs(follows) < FOLLOWS:
                 seen.append(f"{where}, which it hardly follows (correlation {follows:.2f}): check its clock and its "
                              "frame; such a log shows neither its sign nor its unit.")
-            elif gain < 0 and channel == "ground_truth" and name == "v":
-                reversed_ones.append(f"{where}: its sign is reversed. The outside pose moves against its own yaw: add "
-                                     "pi to yaw, or negate the commands' v, whichever is wrong.")
-            elif gain < 0 and channel == "ground_truth":
-                reversed_ones.append(f"{where}: it turns against the commands, and x and y with it. Either z of its "
-                                     "frame points down (NED): negate y and yaw; or the commands' omega has the wrong "
-                                     "sign.")
             elif gain < 0:
-                reversed_ones.append(f"{where}: its sign is reversed. Forward is positive v, counter-clockwise "
-                                     "positive omega and yaw; negate it.")
+                reversed_ones.append(f"{where}{_reversal(channel, name)}")
             elif odd and (limit := _limit(trials, channel, index)) is not None:
                 found.append(f"{where}, but follows commands below {limit:.2g} {unit}: it is limited to about that. "
                              "Larger commands act as that one; cut them in command.csv before a fit.")
@@ -192,6 +184,17 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
                      f"gyro by more than {LOST:g} rad, however late it is: the outside pose was lost there. Errors "
                      "against it say little of a model; a fit leaves such trials out.")
     return found
+
+
+def _reversal(channel: str, name: str) -> str:
+    """What a speed or a yaw rate against the command means, and what to negate."""
+    if channel != "ground_truth":
+        return ": its sign is reversed. Forward is positive v, counter-clockwise positive omega and yaw; negate it."
+    if name == "v":
+        return (": its sign is reversed. The outside pose moves against its own yaw: add pi to yaw, or negate the "
+                "commands' v, whichever is wrong.")
+    return (": it turns against the commands, and x and y with it. Either z of its frame points down (NED): negate y "
+            "and yaw; or the commands' omega has the wrong sign.")
 
 
 def _gains(
