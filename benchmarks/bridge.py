@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bridge_faults import FAULTS, Figures, fault_rows, measure_faults
+from benchmarks.bridge_robot import environment_of
 from bridge.options import Parser, in_range, whole
 from bridge.simulated import Frame
 from whill_mjx.io.command_line import guarded
@@ -132,7 +133,7 @@ class Run:
         for path in (self.results, self.drive_results):
             path.unlink(missing_ok=True)
         self._cores = place.cores
-        self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        self._environment = environment_of(domain)
         scheduling = ("--realtime", "20") if place.realtime else ()
         self.drive = self._start("bridge.drive", str(policy), "--results", str(self.drive_results), *scheduling)
         self.simulate = self._start("bridge.simulate", "--simulator", f"benchmarks.bridge:{robot}", "--results",

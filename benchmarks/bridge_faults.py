@@ -23,7 +23,7 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.bridge_robot import Robot, Switch, message_type
+from benchmarks.bridge_robot import Robot, Switch, environment_of, message_type
 
 Figures = dict[str, tuple[Any, ...]]
 """Repeats, unit and, where there is one, a table of more, of each figure by its name."""
@@ -51,7 +51,7 @@ class Bridge:
         if SIMULATED[-1] in options:
             self.robot.clock()
         self.other: Any = None
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        environment = environment_of(domain)
         self.process = subprocess.Popen([sys.executable, "-m", module, str(policy), *options], env=environment,
                                         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         if LIFECYCLE[0] in options:

@@ -27,6 +27,7 @@ import numpy as np
 
 from benchmarks.bridge import CLAIM, EndlessRobot, burners, cpu_model, entries, memory_mb
 from benchmarks.bridge_faults import Figures
+from benchmarks.bridge_robot import environment_of
 from benchmarks.harness import record
 from bridge.episodes import PATIENCE
 from bridge.options import Parser, in_range, whole
@@ -93,11 +94,6 @@ def numbers_of(image: np.ndarray) -> tuple[int, int]:
     """Episode and step, one of the first 64, that an image shows."""
     high, low = (int(value) for value in image[1, :2, 0])
     return 256 * high + low, int(np.flatnonzero(image[0, :, 0] != 120)[0])
-
-
-def environment_of(domain: int) -> dict[str, str]:
-    """The environment of processes on a domain of this computer."""
-    return {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
 def rows_kept(kind: str, domain: int, seconds: float, folder: Path) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import signal
 import subprocess
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.bridge_robot import Robot
+from benchmarks.bridge_robot import Robot, environment_of
 from bridge.episodes import EpisodeClient
 
 PATIENCE = 120.0
@@ -53,8 +52,7 @@ class Station:
     def __init__(self, domain: int, logs: Path) -> None:
         self.domain, self._logs = domain, logs
         logs.mkdir(parents=True, exist_ok=True)
-        self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(logs),
-                             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        self._environment = {**environment_of(domain), "ROS_LOG_DIR": str(logs)}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def log(self, name: str) -> Path:

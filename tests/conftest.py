@@ -25,22 +25,13 @@ if jaxlib.__version__.startswith("0.10."):
     # Half the time to compile; later versions of XLA do not know this flag, and end over one that they do not know.
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FLAGS]).strip()
+os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("loopback.xml"))
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"
 MOST_BYTES = 2_000_000_000
 """Memory of a worker beyond which it forgets what it has compiled."""
 
 QUICK_TO_COMPILE = ("dreamer", "whill_mjx", "test_among.py", "test_calibration.py")
 """Folders and files whose programs take far longer to compile than to run; most of `sysid` replay many long drives."""
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """With `--dist loadgroup` the tests of a file stay in one worker, and so do all those of the bridge.
-
-    Domains should keep nodes apart, but Fast DDS shares its first ports of shared memory between all domains of a host.
-    """
-    for item in items:
-        file = item.nodeid.partition("::")[0]
-        item.add_marker(pytest.mark.xdist_group("bridge" if "tests/bridge/" in file else file))
 
 
 def pytest_collection_finish():

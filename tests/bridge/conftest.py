@@ -1,13 +1,10 @@
 """Fixtures of the tests with real ROS nodes."""
 
 import importlib.util
-import os
 
 import pytest
 import tiny_policy
 from ros_graph import Graph, free_domain
-
-os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")  # of peers in this process, as `LOOPBACK` of the others
 
 
 @pytest.fixture

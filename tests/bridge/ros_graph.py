@@ -33,20 +33,16 @@ def free_domain():
             return
 
 
-PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
-LOOPBACK = Path(__file__).parent / "udp.xml"
-"""Profile of the processes: no shared memory, whose ports are those of the whole host."""
 WAIT = 120
 """Seconds after which a condition counts as one that never comes true; a machine that tests in parallel is slow."""
 SIGNAL_AGE = ("--signal-age", "20")
 """Of nodes that drive: on a busy machine an emergency stop may be silent for longer than the usual 0.5 s."""
 
 
-def segments(pid):
-    """Files of shared memory that a process has mapped; one that is killed leaves them behind."""
-    with contextlib.suppress(OSError), open(f"/proc/{pid}/maps") as file:
-        return {line.split()[-1] for line in file if "/dev/shm/fastrtps_" in line}
-    return set()
+def commands_per_period(outcome, episode):
+    """Commands per image from the first motion of an episode on: before it a standing bridge is silent."""
+    within = [t for t, v, _ in outcome["commands"] if episode["began"] <= t <= episode["ended"] and v]
+    return len(within) / sum(within[0] <= t <= episode["ended"] for t in outcome["image_times"])
 
 
 class Graph:
@@ -54,10 +50,9 @@ class Graph:
 
     def __init__(self, folder, domain):
         self.folder, self.domain, self.processes, self.peers = folder, domain, {}, []
-        self.leftovers = set()
         python_path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "bridge")])
-        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-                            "PYTHONPATH": python_path, "ROS_LOG_DIR": str(folder / "log"), PROFILE: str(LOOPBACK)}
+        self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": python_path,
+                            "ROS_LOG_DIR": str(folder / "log")}
 
     def start(self, name, *arguments, key=None):
         key = key or name
@@ -80,7 +75,6 @@ class Graph:
 
     def end(self, name, number=signal.SIGTERM):
         """Send a signal and return the exit code."""
-        self.leftovers |= segments(self.processes[name].pid) if number == signal.SIGKILL else set()
         self.processes[name].send_signal(number)
         return self.wait(name)
 
@@ -102,8 +96,5 @@ class Graph:
             peer.close()
         for process in self.processes.values():
             if process.poll() is None:
-                self.leftovers |= segments(process.pid)
                 process.kill()
                 process.wait()
-        for path in self.leftovers:
-            Path(path).unlink(missing_ok=True)

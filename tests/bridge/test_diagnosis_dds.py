@@ -8,12 +8,6 @@ def robot_with(graph, **camera):
     return robot
 
 
-def test_images_lost_in_a_small_shared_memory_segment_are_named_with_the_profile_to_use(graph, policy):
-    robot = robot_with(graph, size=(720, 1280))  # this process has the default settings of Fast DDS
-    graph.start("drive", policy)
-    robot.wait_for_status(causes="fastdds.xml")
-
-
 def test_camera_clock_that_is_off_is_named_by_how_much_and_the_drive_goes_on_when_it_is_set(graph, policy):
     robot = robot_with(graph)
     robot.clock_offset = -10.0

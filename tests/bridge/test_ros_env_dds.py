@@ -18,7 +18,6 @@ def env(graph, monkeypatch):
 
     def make(**options):
         monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         made.append(RosEnv(**options))
         return made[-1]
 
