@@ -21,10 +21,12 @@ class Base:
     """Smallest command the base takes: v [m/s], omega [rad/s]."""
     high: tuple[float, float] = (math.inf, math.inf)
     """Largest command the base takes."""
+    expiry: float = math.inf
+    """Seconds after which the base forgets a command."""
 
 
 WHILL = Base("whill", hold_zeros=False, low=(-500 / WHILL_SPEED_UNITS, -750 / WHILL_TURN_UNITS),
-             high=(1500 / WHILL_SPEED_UNITS, 750 / WHILL_TURN_UNITS))
+             high=(1500 / WHILL_SPEED_UNITS, 750 / WHILL_TURN_UNITS), expiry=0.2)
 """WHILL Model CR and CR2: a command expires after 200 ms, and each velocity packet disables the joystick."""
 GENERIC = Base("generic", hold_zeros=True)
 """A base of unknown behaviour: assume that it keeps the last command for ever."""

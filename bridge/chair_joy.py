@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from bridge import ros
+from bridge.bases import WHILL
 from bridge.exits import Exit
 from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
 from bridge.parameters import command_line
-from bridge.whill import COMMAND_EXPIRY
 
 JOY_TOPIC = "whill/controller/joy"
 STEPS = 100
@@ -67,7 +67,7 @@ class Expiry:
 
     def zero_is_due(self, now: float) -> bool:
         """Return whether to send a zero now; asking counts it as sent."""
-        if now - self._heard <= COMMAND_EXPIRY or not self._left:
+        if now - self._heard <= WHILL.expiry or not self._left:
             return False
         self._left -= 1
         return True

@@ -21,6 +21,8 @@ from bridge.view import View
 
 BACKSTOP = 1.25
 """Periods without a command after which the last one is sent again (while its frame is young) or zero."""
+BEFORE_EXPIRY = 0.75
+"""Share of the time after which the base forgets a command, at which it is sent again at the latest."""
 BLIND_FRAMES = 5
 """Uniform frames in a row that count as a dark or saturated camera."""
 BLIND = "dark or saturated camera"
@@ -70,6 +72,7 @@ class Controller:
         self._pace_by_stamp = pace_by_stamp
         self._view = view or View(policy.pacer.size if policy.pacer.kind == "camera" else (1, 1))
         self._period = 1 / policy.commands.rate_hz
+        self._backstop = min(BACKSTOP * self._period, BEFORE_EXPIRY * safety.expiry)
         self.senses = Senses(policy.sensors, policy.pacer, self._period, self.supervisor)
         self._waiting: tuple[float, np.ndarray] | None = None
         self._due = -np.inf
@@ -165,14 +168,14 @@ class Controller:
         return self._send(now, command)
 
     def on_tick(self, now: float) -> Command | None:
-        """Return a command where one is due although no frame came: a stop at once, else after BACKSTOP periods."""
+        """Return a command where one is due although no frame came: a stop at once, else the last one again."""
         if self.senses.streams:
             self.senses.watch(now)
             if self._waiting is not None and now - self._waiting[0] >= PATIENCE:
                 return self._step(now, self._waiting[1])
         command = self.supervisor.tick(now)
         stops_now = command.reason != "" and self._last.reason == ""
-        if stops_now or now - self._sent >= BACKSTOP * self._period:
+        if stops_now or now - self._sent >= self._backstop:
             return self._send(now, command)
         return None
 

@@ -86,7 +86,7 @@ def safety_config(policy: Policy, options: argparse.Namespace) -> SafetyConfig:
                           "moves. Correct them or leave them out.")
     return SafetyConfig(low=low, high=high, slew=(options.slew[0], options.slew[1]),
                         frame_age=options.frame_age, stamp_age=options.stamp_age,
-                        hold_zeros=BASES[options.base].hold_zeros,
+                        hold_zeros=BASES[options.base].hold_zeros, expiry=BASES[options.base].expiry,
                         require_arm=options.require_arm, auto_resume=options.resume == "auto")
 
 
@@ -147,7 +147,7 @@ class DriveNode(VehicleNode):
     def causes(self) -> list[str]:
         """Return what is wrong with sensors, base and guard now, each with its remedy."""
         now = time.monotonic()
-        found = causes(self._evidence())
+        found = causes(self._evidence()) + super().causes()
         for name, stream in self.controller.senses.streams.items():
             topic = self._topics[name]
             publishers = self._publishers.get(name, [])

@@ -9,6 +9,7 @@ gives no sign of life for SILENCE seconds, the guard publishes zeros. It never p
 
 import argparse
 import json
+import math
 import subprocess
 import sys
 import time
@@ -59,6 +60,7 @@ class Watchdog:
         self._stands = False  # whether the last command on the topic was zero
         self._left = 0
         self._next = self._ticked = 0.0
+        self._stopped = -math.inf  # time of the last stop, while nobody has moved the vehicle since
 
     def heartbeat(self, now: float, session: str, driving: bool) -> None:
         """Take a heartbeat of a policy node."""
@@ -75,7 +77,12 @@ class Watchdog:
         """Take a command from the topic; the guard's own zeros come back here and change nothing."""
         self._stands = not moves
         if moves:
-            self._left = 0  # somebody drives: never fight
+            self._left, self._stopped = 0, -math.inf  # somebody drives: never fight
+
+    def new_listener(self, now: float) -> None:
+        """Send the zeros of a stop again: a listener was found just after it, as by a guard that has just begun."""
+        if now - self._stopped <= FORGET:
+            self._left, self._next = REPEATS, now
 
     def tick(self, now: float) -> bool:
         """Return whether to publish a zero now."""
@@ -86,7 +93,7 @@ class Watchdog:
                 del self._driving[session]
                 self.abandoned = True
                 if not self._stands:
-                    self._left, self._next = REPEATS, now
+                    self._left, self._next, self._stopped = REPEATS, now, now
                     self.stops += 1
         for session, heard in list(self.heard.items()):
             if read - heard > FORGET:
@@ -111,7 +118,7 @@ class GuardNode:
         if ros.uses_simulated_time(node):
             self.now, self.watchdog = (vehicle_time := VehicleTime()), Watchdog(SIMULATED * SILENCE)
             ros.subscribe_clock(node, lambda _: vehicle_time.on_clock())
-        self._ready = False
+        self._ready, self._matched = False, 0
         self._lock = JoystickLock(ros.joystick_locker(node)) if options.joystick_lock else None
         self._type = String
         self.topic = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
@@ -158,6 +165,10 @@ class GuardNode:
         before, topic = self._ready, self.topic
         there = topic.look() and any(map(topic.hears_us, topic.listeners()))
         self._ready = there and (before or topic.reaches_all())  # a further reader does not end a drive
+        matched = topic.publisher.get_subscription_count() if topic.publisher is not None else 0
+        if matched > self._matched:
+            self.watchdog.new_listener(self.now())
+        self._matched = matched
         if self._ready and not before:
             self.node.get_logger().info(f"guarding {self.topic.name} ({self.topic.kind})")
 

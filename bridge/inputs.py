@@ -40,6 +40,8 @@ class SafetyInputs:
     def __init__(self, supervisor: Supervisor, options: argparse.Namespace) -> None:
         """Set the inputs in force; `options` are those that `add_options` declares."""
         self.supervisor, self.options = supervisor, options
+        self.topics: list[str] = []
+        """What is subscribed to, before remapping."""
         self._e_stop, self._enable, self._button = (Signal(options.signal_age) for _ in range(3))
 
     def on_e_stop(self, now: float, pulled: bool) -> None:
@@ -82,6 +84,8 @@ class SafetyInputs:
         from std_msgs.msg import Bool
 
         def listen(topic: str, take: Callable[[float, bool], None]) -> None:
+            self.topics.append(topic)
+
             def heard(message: Any) -> None:
                 now = clock()
                 take(now, message.data)
@@ -103,6 +107,7 @@ class SafetyInputs:
                 self.on_joy(now, list(message.buttons))
                 changed(now)
 
+            self.topics.append(ros.JOY_TOPIC)
             node.create_subscription(Joy, ros.JOY_TOPIC, on_joy, ros.best_effort())
 
 

@@ -94,6 +94,8 @@ class SafetyConfig:
     """Another driver that was silent for this long [s] has let go."""
     hold_zeros: bool = True
     """True: repeat zeros for as long as the vehicle stands. False: send `stop_zeros` of them, then fall silent."""
+    expiry: float = math.inf
+    """The base forgets a command after this long [s], so it is sent again before."""
     stop_zeros: int = 6
     """Zeros per stop where they are not held."""
     require_arm: bool = False

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bridge import ros
+from bridge.bases import WHILL
 from bridge.episodes import PROTOCOL, Calls, number, whole
 from bridge.policy import pacer_of
 from bridge.sense_topics import message_of, topics_of
@@ -29,8 +30,6 @@ MATCHING = 0.3
 """Seconds between finding a reader and its having found us; a frame sent earlier is lost."""
 LOG_LENGTH = 100_000
 """Commands and delays that are kept for the results file."""
-COMMAND_EXPIRY = 0.2
-"""The chair's controller forgets a command after this time [s]."""
 RESULTS = ("episodes", "image_times", "commands", "stops_at_end", "frame_to_command")
 """Keys of the results file."""
 
@@ -249,7 +248,7 @@ class SimulateNode:
         if not self.command_log:
             return 0.0, 0.0
         received, v, omega = self.command_log[-1]
-        expired = time.monotonic() - received > COMMAND_EXPIRY / self.clock.speed
+        expired = time.monotonic() - received > WHILL.expiry / self.clock.speed
         return (0.0, 0.0) if expired or not (math.isfinite(v) and math.isfinite(omega)) else (v, omega)
 
     def _stamped(self, frame_id: str) -> Any:

@@ -37,6 +37,8 @@ CLOCK_STEP = 0.1
 """Difference [s] of wall and steady clock between two watches that counts as a clock jump."""
 NO_GUARD, NO_BASE, COMMANDERS = "no guard", "no base listens", "another node publishes commands"
 LOOKING = "looking for other nodes that publish commands"
+MIXED_SIGNALS = "a safety signal has two publishers"
+"""ROS does not name the sender of a message, so one that says "released" would hide another that says "pulled"."""
 NOT_ACTIVE = "not activated"
 GUARD_STOPPED = "the guard stopped the vehicle"
 UNLOCKING = 1.0
@@ -78,6 +80,7 @@ class VehicleNode:
         self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
                                self._start_guard if options.guard == "own" else None, isinstance(now, VehicleTime))
         self._inputs = inputs.SafetyInputs(self.supervisor, options)
+        self._mixed: list[str] = []  # sentences on signals with more than one publisher
         self._ear = Ear()
         self._string = String
         self._status = node.create_publisher(String, ros.STATUS_TOPIC, ros.reliable())
@@ -111,7 +114,7 @@ class VehicleNode:
 
     def causes(self) -> list[str]:
         """Return what is wrong now, each with its remedy."""
-        return []
+        return self._mixed
 
     def has_time(self, now: float) -> bool:
         """Return whether looking at the graph would delay nothing now."""
@@ -238,6 +241,11 @@ class VehicleNode:
         self.commands.look()
         self._listeners = self.commands.listeners()
         self.supervisor.block(NO_BASE, not any(map(self.commands.hears_us, self._listeners)))
+        publishers = {topic: ros.publishers_of(self.node, topic) for topic in self._inputs.topics}
+        self._mixed = [f"{self.node.resolve_topic_name(topic)} has {len(names)} publishers ({', '.join(names)}): the "
+                       "bridge cannot know whose value it hears; let one node publish for all"
+                       for topic, names in publishers.items() if len(names) > 1]
+        self.supervisor.block(MIXED_SIGNALS, bool(self._mixed))
         self._others.look(now, self.commands.commanders())
         self._commanders = self._others.names(now)
         alone = not self.options.allow_other_commanders

@@ -8,7 +8,7 @@ itself limits nothing, has no time-out and publishes no odometry.
 import math
 import statistics
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bridge.bases import WHILL_SPEED_UNITS, WHILL_TURN_UNITS
@@ -18,8 +18,6 @@ WHEEL_RADIUS = 0.1325
 """[m], of the maker's driver and URDF; a loaded tyre is smaller: measure it."""
 TREAD = 0.496
 """[m], of the maker's driver."""
-COMMAND_EXPIRY = 0.2
-"""Seconds after which the chair forgets a velocity command."""
 KMH = 1 / 3.6
 """One km/h in m/s."""
 STATE_AGE = 1.5
@@ -124,12 +122,14 @@ class WheelOdometry:
         the usual interval gives the mean speed since the one before that.
         """
         before, self._last = self._last, (now, state)
-        if before is None or now <= before[0]:
+        if before is not None and now <= before[0]:
             return self.pose
-        elapsed = now - before[0]
-        if elapsed > self._longest_gap:
-            self.gaps += 1
+        elapsed = now - before[0] if before is not None else math.inf
+        if before is None or elapsed > self._longest_gap:
+            self.gaps += before is not None
             self._places.clear()
+            v, omega = reported_speed(state, self._tread)
+            self.pose = replace(self.pose, v=v, omega=omega)
             return self.pose
         left = self._travel(before[1].left_motor_angle, state.left_motor_angle,
                             before[1].left_motor_speed, state.left_motor_speed, elapsed)

@@ -6,7 +6,8 @@ for 200 ms, ignores the rider's joystick meanwhile, and changes its speed by abo
 
 import math
 
-from bridge.whill import COMMAND_EXPIRY, KMH, TREAD, WHEEL_RADIUS, ChairState, command_of_words, command_words
+from bridge.bases import WHILL
+from bridge.whill import KMH, TREAD, WHEEL_RADIUS, ChairState, command_of_words, command_words
 
 RAMP = 1.7
 """[m/s2]"""
@@ -40,7 +41,7 @@ class FakeChair:
         forward, turn = (wrap_16_bits(word) for word in command_words(v, omega))
         if -500 <= forward <= 1500 and -750 <= turn <= 750:
             self._target = command_of_words(forward, turn)
-        self._until = self.now + COMMAND_EXPIRY
+        self._until = self.now + WHILL.expiry
 
     def advance(self, dt):
         """Move on by a time [s]."""

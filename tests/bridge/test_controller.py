@@ -56,9 +56,9 @@ class ScriptedPolicy:
 class World:
     """A camera, a steady clock and a wall clock."""
 
-    def __init__(self, options=None, hold_zeros=True, **contract):
+    def __init__(self, options=None, hold_zeros=True, limits=None, **contract):
         self.policy = ScriptedPolicy(FakeContract(**contract))
-        safety = SafetyConfig((-0.5, -1.0), (1.0, 1.0), hold_zeros=hold_zeros)
+        safety = SafetyConfig((-0.5, -1.0), (1.0, 1.0), hold_zeros=hold_zeros, **(limits or {}))
         self.controller = Controller(self.policy, safety, clock=lambda: 0.0, **(options or {}))
         self.now, self.count = 10.0, 0
 
@@ -110,6 +110,13 @@ def test_silent_camera_stops_the_vehicle_within_250_ms_of_its_last_frame():
     assert world.policy.steps == 0  # nothing is fed while standing
     world.image()
     assert world.policy.steps == 1  # after a reset
+
+
+def test_command_of_a_slow_policy_is_sent_again_before_the_base_forgets_it():
+    world = World(limits={"frame_age": 1.0, "expiry": 0.2}, rate_hz=2.0)
+    assert [world.image(dt=0.5) for _ in range(4)][-1].v == 0.4
+    again = [i for i in range(1, 50) if (command := world.tick(0.01)) is not None and command.v == 0.4]
+    assert len(again) == 3 and max(np.diff([0, *again])) < 20
 
 
 def test_base_that_stops_by_itself_gets_no_packet_before_the_first_drive_and_six_zeros_after_it():

@@ -46,3 +46,14 @@ def test_image_topic_of_another_type_is_named(graph, policy):
     robot.publisher("sensor_msgs/CompressedImage", "sensing/camera/front/image_raw")
     graph.start("drive", policy)
     robot.wait_for_status(reason="no frame yet", causes="--compressed")
+
+
+def test_emergency_stop_of_two_publishers_holds_the_vehicle_and_both_are_named(graph, policy):
+    robot = robot_with(graph)
+    graph.start("drive", policy)
+    robot.wait_for_status(driving=True)
+    second = graph.peer("second")
+    second.e_stop()
+    robot.wait_for_status(driving=False, holds="a safety signal has two publishers", causes="(/robot, /second)")
+    graph.peers.remove(second), second.close()
+    robot.wait_for_status(driving=True, causes="[]")

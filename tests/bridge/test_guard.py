@@ -84,6 +84,7 @@ def test_guard_is_ready_when_every_reader_is_matched_the_bases_among_them(matche
     guard = GuardNode.__new__(GuardNode)
     names = ("bridge_drive", "bridge_guard", "base")  # the node's and the guard's own ears are matched first
     guard.node, guard._ready, topic = node, False, CommandTopic.__new__(CommandTopic)
+    guard._matched, guard.watchdog, guard.now = 0, Watchdog(), lambda: 1.0
     topic.name, topic.kind, topic._known = "/cmd_vel", "Twist", ["/bridge_drive", "/bridge_guard"]
     topic.publisher = types.SimpleNamespace(get_subscription_count=lambda: matched)
     monkeypatch.setattr(topic, "readers", lambda: [Endpoint(f"/{name}", "geometry_msgs/msg/Twist") for name in names])
@@ -222,3 +223,26 @@ def test_each_signal_leaves_the_spin_so_that_the_node_can_say_goodbye(number, mo
         assert executor.served == 1 and executor.number is None and signal.getsignal(number) == signal.SIG_DFL
     finally:
         signal.signal(number, found)
+
+
+def test_guard_sends_the_zeros_of_a_stop_again_to_a_listener_that_it_finds_just_after_it():
+    guard = Watchdog()
+    beats(guard, 0, 100)
+    guard.command(True)
+    assert len(silence(guard, 100, 200)) == 10
+    guard.new_listener(2.0)
+    assert len(silence(guard, 200, 300)) == 10
+    guard.new_listener(3.2)  # long after the stop, a listener is a rider's tool
+    assert not silence(guard, 320, 400)
+
+
+def test_guard_sends_nothing_to_a_new_listener_when_somebody_drives_or_nobody_was_stopped():
+    guard = Watchdog()
+    guard.new_listener(0.5)
+    beats(guard, 0, 100)
+    guard.new_listener(0.99)
+    guard.command(True)
+    assert len(silence(guard, 100, 200)) == 10
+    guard.command(True)
+    guard.new_listener(2.0)
+    assert not silence(guard, 200, 300)

@@ -83,13 +83,15 @@ def test_state_that_was_held_up_and_comes_with_the_next_one_makes_no_speed_of_it
     assert abs(pose.x - chair.x) < 0.01
 
 
-def test_odometry_of_a_long_gap_keeps_the_pose_and_counts_it():
+def test_odometry_of_a_long_gap_keeps_the_pose_counts_it_and_takes_the_speed_that_the_chair_reports():
     odometry = WheelOdometry()
     odometry.update(0.0, ChairState())
     odometry.update(0.5, ChairState(left_motor_angle=0.5, right_motor_angle=-0.5))
     before = odometry.pose
-    odometry.update(9.0, ChairState(left_motor_angle=2.5, right_motor_angle=-2.0))
-    assert odometry.pose == before and odometry.gaps == 1 and before.x == pytest.approx(0.06625)
+    after = odometry.update(9.0, ChairState(left_motor_angle=2.5, right_motor_angle=-2.0, left_motor_speed=1.8,
+                                            right_motor_speed=-1.8))
+    assert (after.x, after.y, after.yaw) == (before.x, before.y, before.yaw) and before.x == pytest.approx(0.06625)
+    assert odometry.gaps == 1 and (after.v, after.omega) == pytest.approx((0.5, 0.0)) and before.v != after.v
     odometry.update(9.5, ChairState(left_motor_angle=2.6, right_motor_angle=-2.1))
     assert odometry.pose.x > before.x
 
