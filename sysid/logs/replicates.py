@@ -137,14 +137,18 @@ def may_be_alike(a: Glance, b: Glance) -> bool:
     return bool(((values >= b.low[:count] - allowed) & (values <= b.high[:count] + allowed)).all())
 
 
-def same_course(trials: Sequence[Trial], most: float = np.inf) -> list[list[int]]:
-    """Indices of trials of one manoeuvre with the same commands, at most `most` s apart; single ones too."""
+def same_course(trials: Sequence[Trial], most: float = np.inf, by_name: bool = True) -> list[list[int]]:
+    """Indices of trials of one manoeuvre with the same commands, at most `most` s apart; single ones too.
+
+    Whoever gives two drives of the same commands different names may know of a difference, such as a load; with
+    `by_name` False the names do not count.
+    """
     courses = [course_of(trial) for trial in trials]
     glances = [glance(course) for course in courses]
     groups: list[list[int]] = []
     of_manoeuvre: dict[str, list[list[int]]] = {}
     for i, trial in enumerate(trials):
-        mine = of_manoeuvre.setdefault(trial.manoeuvre, [])
+        mine = of_manoeuvre.setdefault(trial.manoeuvre if by_name else "", [])
         for group in mine:
             if not may_be_alike(glances[group[0]], glances[i]):
                 continue

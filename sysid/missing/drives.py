@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -78,6 +80,11 @@ class Drives:
             numbers[rest] = numbers[rest].min(initial=len(numbers))
         return numbers
 
+    @cached_property
+    def began(self) -> np.ndarray:
+        """(B,) time of the session at which each trial began [s], nan where nothing says it."""
+        return session_times(self.trials)
+
     def weighted(self, simulated: np.ndarray, factors: np.ndarray, track: float) -> Drives:
         """The same drives with rough bins, as `simulated` (B, K, 5) shows them, weighted by noise `factors` (4, 5)."""
         level = roughness(simulated, self.features.width, track)
@@ -118,7 +125,7 @@ class Drives:
         """Values (N, P) of one drive each (N,), with the time of the session at which that drive began."""
         if SESSION not in self.names or DRAIN not in self.names:
             return values
-        began = np.array([began_at(trial) for trial in self.trials])[drives]
+        began = self.began[drives]
         known = np.isfinite(began) & (values[:, self.names.index(DRAIN)] != 0)
         out = values.copy()
         out[known, self.names.index(SESSION)] = began[known]
@@ -163,11 +170,21 @@ class Drives:
                       features.of(measured))
 
 
-def began_at(trial: Trial) -> float:
-    """Time of the session at which a trial began [s], as replicates are driven round by round: the middle of the round
-    that its name counts. nan where the name counts none."""
-    number = re.fullmatch(r".*_(\d{1,2})", trial.name)
-    return (int(number.group(1)) - 0.5) * ROUND if number else float("nan")
+def session_times(trials: Sequence[Trial]) -> np.ndarray:
+    """(B,) times of the session at which trials began [s]: replicates are driven round by round, so each began in the
+    middle of the round that its name counts.
+
+    A name counts rounds where all drives of its manoeuvre have the same commands and are numbered, such as circle_1 to
+    circle_3. A date, or the running number of a recording, does not: nan.
+    """
+    began, alike = np.full(len(trials), np.nan), Counter(trial.manoeuvre for trial in trials)
+    for group in same_course(trials):
+        manoeuvre = trials[group[0]].manoeuvre
+        found = [re.fullmatch(re.escape(manoeuvre) + r"_(\d{1,2})", trials[i].name) for i in group]
+        rounds = [int(one.group(1)) for one in found if one]
+        if len(rounds) == len(group) == alike[manoeuvre] and (len(group) > 1 or rounds == [1]):
+            began[group] = (np.array(rounds) - 0.5) * ROUND
+    return began
 
 
 def make_drives(vehicle: FreeVehicle, trials: tuple[Trial, ...], width: float | None = None,

@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
+from sysid.logs.replicates import same_course
 from sysid.missing.catalogue import LEVELS, Hypothesis, base_values
 from sysid.missing.days import Leftover, Reference, alike, difference_sizes
 from sysid.missing.drives import Drives
@@ -107,20 +107,29 @@ def gather(
     evidence = Evidence(
         residual, design, offset, placed, np.linalg.inv(reference.spread),
         np.einsum("bni,bnj->bij", design, design, optimize=True), np.einsum("bni,bn->bi", design, residual),
-        tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives),
+        tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives.trials),
         reference.shared)
     return evidence, slopes
 
 
-def manoeuvre_groups(drives: Drives) -> tuple[tuple[int, ...], ...]:
-    """Trials of one manoeuvre, in order of first appearance; single windows of a long drive are put into eighths."""
-    names: dict[str, list[int]] = {}
-    for i, trial in enumerate(drives.trials):
-        names.setdefault(trial.manoeuvre, []).append(i)
-    if len(names) > 40 or len(names) < len(drives.trials) and not repeated(drives.trials):
-        parts = np.array_split(np.arange(len(drives.trials)), min(8, len(drives.trials)))
+def manoeuvre_groups(trials: Sequence[Trial]) -> tuple[tuple[int, ...], ...]:
+    """Trials of the same commands, whatever their names, in order of first appearance: what is held back together.
+
+    Where none repeats another and names are shared, they are windows of long drives: these are put into eighths, and so
+    are more than 40 groups.
+    """
+    groups, names = same_course(trials, by_name=False), {trial.manoeuvre for trial in trials}
+    if len(groups) > 40 or len(names) < len(trials) == len(groups):
+        parts = np.array_split(np.arange(len(trials)), min(8, len(trials)))
         return tuple(tuple(int(i) for i in part) for part in parts)
-    return tuple(tuple(each) for each in names.values())
+    return tuple(map(tuple, groups))
+
+
+def group_names(trials: Sequence[Trial], groups: Sequence[Sequence[int]]) -> list[str]:
+    """A name of each group: that of its manoeuvre, or of its first trial where groups share a manoeuvre."""
+    manoeuvres = [trials[group[0]].manoeuvre for group in groups]
+    return [one if manoeuvres.count(one) == 1 else trials[group[0]].name
+            for one, group in zip(manoeuvres, groups, strict=True)]
 
 
 def _pool(reference: Reference, trial: Trial, mask: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.missing.signatures import group_names
 from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import as_report as predictions_of
 from sysid.verdict.forms import forms_of
@@ -34,7 +35,7 @@ def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
     sizes, errors = (one.sizes, one.errors) if one else sizes_apart(final, part, groups, precision)
     left_out = one.foretold if one else foretold(final, part, groups, precision)
     agreement = heterogeneity(sizes, errors)
-    names = [result.log.training[group[0]].manoeuvre for group in groups]
+    names = group_names(result.log.training, groups)
     return {"left_out_gain": dict(zip(names, left_out.tolist(), strict=True)), "left_out_total": float(left_out.sum()),
             "left_out_interval": list(interval_of_sum(left_out)),
             "by_manoeuvre": [{"manoeuvre": name, "factor": float(size), "standard_error": float(error),

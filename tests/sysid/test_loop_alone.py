@@ -11,11 +11,12 @@ import pytest
 from linear_drives import EFFECTS, Linear, drives
 
 from sysid.errors.features import BIN, bin_width, make_features
-from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial
+from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import no_wander
+from sysid.missing.drives import session_times
 from sysid.missing.joint_fit import Start as JointStart
-from sysid.missing.signatures import manoeuvre_groups
+from sysid.missing.signatures import group_names, manoeuvre_groups
 from sysid.replay.one_drive import Commanded, path_of
 from sysid.replay.rollout import make_batch
 from sysid.verdict import alone
@@ -66,12 +67,37 @@ def test_bins_that_a_break_of_the_pose_touches_are_not_measured():
 
 def test_windows_without_replicates_are_put_into_eighths_and_replicates_are_not():
     windows = tuple(window(f"run/{i}", speed=1.0 + 0.1 * i) for i in range(16))
-    assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=windows))] == [2] * 8
-    assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=windows[:5]))] == [1] * 5
+    assert [len(group) for group in manoeuvre_groups(windows)] == [2] * 8
+    assert [len(group) for group in manoeuvre_groups(windows[:5])] == [1] * 5
     assert stands_alone(windows, known=False) and not stands_alone(windows, known=True)
     again = tuple(window(f"run/{i}") for i in range(16))
-    assert [len(group) for group in manoeuvre_groups(SimpleNamespace(trials=again))] == [16]
+    assert [len(group) for group in manoeuvre_groups(again)] == [16]
     assert not stands_alone(again, known=False)
+
+
+@pytest.mark.parametrize("name", ["run_{}", "run{}", "rosbag2_2026_05_01-10_20_{:02d}"])
+def test_what_is_held_back_together_follows_from_the_commands_and_not_from_names_of_files(name):
+    speeds = (1.0, 1.2, 1.4, 1.2, 1.6)
+    trials = tuple(replace(window(name.format(i), speed=speed), manoeuvre=manoeuvre_of(name.format(i)))
+                   for i, speed in enumerate(speeds))
+    groups = manoeuvre_groups(trials)
+    assert groups == ((0,), (1, 3), (2,), (4,))
+    assert len(set(group_names(trials, groups))) == 4
+
+
+@pytest.mark.parametrize("names, began", [
+    (("run_1", "run_2", "run_3"), (100.0, 300.0, 500.0)),
+    (("run_7", "run_60"), (1300.0, 11900.0)),
+    (("run_7",), (np.nan,)),
+    (("run_1",), (100.0,)),
+    (("run_2026_05_01-10_20_30",), (np.nan,)),
+    (("run1", "run2"), (np.nan, np.nan)),
+])
+def test_replicates_were_driven_in_the_rounds_that_their_names_count(names, began):
+    trials = tuple(replace(window(name), manoeuvre=manoeuvre_of(name)) for name in names)
+    np.testing.assert_array_equal(session_times(trials), began)
+    others = tuple(window(f"run_{i}", speed=1.0 + 0.2 * i) for i in range(3))
+    assert np.isnan(session_times(others)).all()
 
 
 def asked_of(evidence, refitter):
