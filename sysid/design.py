@@ -30,6 +30,7 @@ from sysid.logs.sources import refuse_recording
 from whill_mjx.io.fields import Field, check_table
 from whill_mjx.io.folders import check_file, note_written
 from whill_mjx.vehicle.parameters import describe
+from whill_mjx.vehicle.specs import VehicleSpec
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ def main(config: DesignConfig) -> list[Path]:
             check_known("--parameters", name, describe(subject.params))
     spec = subject.spec
     with refusing():
+        check_limits(config, spec)
         limits = Limits(
             max(spec.v_min, -1.0) if config.v_min is None else config.v_min,
             min(spec.v_max, 1.0) if config.v_max is None else config.v_max,
@@ -94,6 +96,16 @@ def main(config: DesignConfig) -> list[Path]:
     for path in paths:
         print(f"wrote {path}")
     return paths
+
+
+def check_limits(config: DesignConfig, spec: VehicleSpec) -> None:
+    """Refuse speeds that the vehicle does not drive: it would clip them, and drive another manoeuvre than planned."""
+    for option, wanted, most, unit in (("--v-max", config.v_max, spec.v_max, "m/s"),
+                                       ("--omega-max", config.omega_max, spec.omega_max, "rad/s"),
+                                       ("--v-min", config.v_min, spec.v_min, "m/s")):
+        if wanted is not None and abs(wanted) > abs(most):
+            raise ValueError(f"{option} {wanted:g}: {config.vehicle} drives {most:g} {unit} at most. Give no more, or "
+                             "correct its spec.")
 
 
 def command_files(config: DesignConfig) -> list[Path]:

@@ -20,6 +20,7 @@ if starts(__name__):
 
 from sysid import command_line
 from sysid.logs.coverage import doubts
+from sysid.logs.log import of_file
 from sysid.logs.measured import load_any
 from sysid.logs.records import Log
 from sysid.pages.fit_page import warning
@@ -77,9 +78,14 @@ def main(arguments: Arguments) -> None:
         model = check_settings(log, settings)
         references = [load_any(path) for path in arguments.reference]
         if arguments.close_loop:
+            from sysid.missing.fit_statistics import load_fitted
             from sysid.verdict.pipeline import check_logs
 
             check_logs(log, references)
+            asked, vehicle = log, None
+            if settings.vehicle is not None:
+                spec, vehicle = load_fitted(settings.vehicle)
+                asked, *references = (of_file(one, spec, str(settings.vehicle)) for one in (log, *references))
     chosen = {"data": log.sha256, "train": arguments.train, "held_out": arguments.held_out,
               "chained": arguments.chained, **settings_of(settings)}
     with run_folder(arguments.out, KIND, OUTPUTS, chosen, {"references": [one.sha256 for one in references]}):
@@ -91,8 +97,8 @@ def main(arguments: Arguments) -> None:
 
             if settings.preset != "physical":
                 print("the loop starts from the physical base model")
-            config = LoopConfig(quick=settings.quick, seed=settings.seed)
-            found = watched(log, references, config)
+            config = LoopConfig(quick=settings.quick, seed=settings.seed, with_effects=settings.effects)
+            found = watched(asked, references, config, vehicle)
             command_line.stage(WRITING)
             write_result(arguments.out / "close_loop", found)
 

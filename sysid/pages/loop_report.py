@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 
 from sysid.errors.noise import said
 from sysid.follow_up import trust
@@ -17,6 +18,7 @@ from sysid.follow_up.changes import by_manoeuvre, worse
 from sysid.follow_up.next_manoeuvre import next_manoeuvre, write_next_command
 from sysid.follow_up.power import calibrated
 from sysid.follow_up.unnamed import as_report, find_unnamed, replay_unnamed, vehicle_of
+from sysid.intervals.independence import CONFIDENCE
 from sysid.logs.coverage import doubts
 from sysid.logs.metrics import own_floor
 from sysid.logs.records import Prediction, Trial
@@ -193,10 +195,12 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     kept = unnamed is not None and unnamed["kept"]
     vehicle = vehicle_of(result, unnamed["parameters"]) if kept else fitted_after(result)
     known = describe(vehicle)
-    bounds = {name: tuple(p["interval"]) for one in report["effects"] for name, p in one["parameters"].items()
+    bounds = {name: narrower(p["interval"], p["value"]) for one in report["effects"]
+              for name, p in one["parameters"].items()
               if name in known and np.isfinite(p["interval"]).all() and not any(p["open"])}
     save_vehicle(out / "vehicle.toml", result.log.spec, vehicle, bounds,
-                 {"made_by": "sysid.close_loop", "dataset": result.log.name, "dataset_sha256": result.log.sha256,
+                 {"made_by": "sysid.close_loop", "interval_confidence": CONFIDENCE,
+                  "dataset": result.log.name, "dataset_sha256": result.log.sha256,
                   "verdict": report["verdict"], "manifest_sha256": report["manifest"]["sha256"],
                   "effects_added": [one["name"] for one in report["effects"]] + ["unnamed"] * kept})
     write_next_command(out, report["next_manoeuvre"])
@@ -205,6 +209,13 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     write_report(out / "report.json", report)
     write_page(out, report)
     write_method(out, report)
+
+
+def narrower(interval: Sequence[float], value: float) -> tuple[float, float]:
+    """The interval of a vehicle file, all of which are read as of CONFIDENCE, of an interval of the report."""
+    share = norm.ppf((1 + CONFIDENCE) / 2) / norm.ppf((1 + trust.CONFIDENCE) / 2)
+    low, high = (value + share * (end - value) for end in interval)
+    return float(low), float(high)
 
 
 def manifest(config: LoopConfig, found: Sequence[Hypothesis], reference: Reference) -> dict[str, Any]:

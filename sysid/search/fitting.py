@@ -37,6 +37,8 @@ from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 
+CHANNELS = {"ground_truth": "outside pose", "odometry": "odometry"}
+"""What a person calls a channel."""
 PASSIVE = "slip_traction.mu_free"
 CENTRE = ("body.com_x", "body.com_y", "body.com_z")
 """Of a skid-steered robot they move the point about which it turns; to a log the tracked point's place is the same."""
@@ -221,7 +223,11 @@ def _training(log: Log, config: FitConfig) -> tuple[Trial, ...]:
     if not log.training:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out, or select with --train.")
     thin.check_moves(log)
-    return tuple(_keep_channels(trial, config.channels) for trial in log.training)
+    trials = tuple(_keep_channels(trial, config.channels) for trial in log.training if _has(trial, config.channels))
+    if not trials:
+        raise ValueError(f"--channels {config.channels}: no training trial of {log.name!r} has "
+                         f"{CHANNELS[config.channels]}. Leave the option out, or name the other channel.")
+    return trials
 
 
 def _subject(
@@ -290,6 +296,11 @@ def subject(log: Log, config: FitConfig, model: Model | None = None) -> tuple[Lo
     of the model's file. ValueError or FileNotFoundError for settings that name neither.
     """
     log = of_earlier(log, config)
+    without = [trial.name for trial in log.training if not _has(trial, config.channels)]
+    if without:
+        channel = CHANNELS[config.channels]
+        note = f"--channels {config.channels}: {', '.join(without)} have no {channel} and are left out"
+        log = log if note in log.notes else replace(log, notes=(*log.notes, note))
     if model is None and config.model:
         model = load_model(config.model, log.spec, config.wheels, config.parameters)
     if model is None or model.instead is None:
@@ -335,12 +346,14 @@ def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list
     return initial, fitted
 
 
+def _has(trial: Trial, channels: str) -> bool:
+    return channels == "both" or getattr(trial, channels) is not None
+
+
 def _keep_channels(trial: Trial, channels: str) -> Trial:
-    if channels == "ground_truth" and trial.ground_truth is not None:
+    if channels == "ground_truth":
         return replace(trial, odometry=None)
-    if channels == "odometry" and trial.odometry is not None:
-        return replace(trial, ground_truth=None)
-    return trial
+    return replace(trial, ground_truth=None) if channels == "odometry" else trial
 
 
 def expected_steps(config: FitConfig) -> int:

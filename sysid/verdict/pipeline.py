@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ import numpy as np
 from sysid import command_line
 from sysid.errors.noise import NoiseLevels
 from sysid.logs.log import check_same_vehicle
-from sysid.logs.records import Log
+from sysid.logs.records import Log, Trial
 from sysid.missing.catalogue import PARAMETER
 from sysid.missing.days import Reference, Wander
 from sysid.missing.evidence import Evidence
@@ -136,6 +137,15 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
         close()
 
 
+def content_of(trial: Trial) -> str:
+    """Hash of all that was recorded of a drive, whatever its name."""
+    found = hashlib.sha256(trial.command.table.tobytes())
+    for stream in (trial.odometry, trial.ground_truth, trial.gyro):
+        for one in (() if stream is None else vars(stream).values()):
+            found.update(np.ascontiguousarray(one).tobytes() if isinstance(one, np.ndarray) else b"-")
+    return found.hexdigest()
+
+
 def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
     """Raise ValueError for logs in which nothing can be found."""
     for one in (log, *references):
@@ -146,11 +156,14 @@ def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
         raise ValueError(f"log {log.name!r} has neither odometry nor an outside pose. Record one of them.")
-    mine = {trial.name for trial in log.trials}
-    for other in references:
-        if other.sha256 == log.sha256 and mine & {trial.name for trial in other.training}:
-            raise ValueError(f"reference {other.name!r} has the drives in question themselves. Give drives of other "
-                             "days.")
+    seen = {content_of(trial): "the drives in question" for trial in log.trials}
+    for number, other in enumerate(references):
+        mine = {content_of(trial): trial.name for trial in other.training}
+        if again := [(name, seen[content]) for content, name in mine.items() if content in seen]:
+            name, place = again[0]
+            raise ValueError(f"reference {other.name!r} has {name!r}, which is among {place} already. Give drives of "
+                             "other days, each once.")
+        seen |= dict.fromkeys(mine, f"those of reference {number + 1}, {other.name!r},")
         if not other.training:
             raise ValueError(f"reference {other.name!r} has no training trial. Leave it out, or take some out of "
                              "held_out.")

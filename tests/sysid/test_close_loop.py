@@ -31,7 +31,7 @@ from sysid.verdict.falsification import course_of, put_to_test
 from sysid.verdict.found import NullRefits
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
-from sysid.verdict.pipeline import find_missing
+from sysid.verdict.pipeline import check_logs, find_missing
 from sysid.verdict.posterior import Findings, posterior, read
 from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
@@ -54,7 +54,7 @@ from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import describe, set_values
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.types import VehicleParams
-from whill_mjx.vehicle.vehicle_file import load_vehicle
+from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle, save_vehicle
 
 DRIVES = ("straight", "circle", "s_curve")
 CONFIG = LoopConfig(quick=True, physics_dt=0.01, iterations=6, draws=200, poses=False)
@@ -130,9 +130,25 @@ def test_a_fit_may_close_the_loop_with_the_same_references(folder, drives, tmp_p
     monkeypatch.setattr("sysid.verdict.pipeline.watched", lambda *given: given)
     monkeypatch.setattr("sysid.pages.loop_report.write_result", lambda *given: asked.append(given))
     fit_main(FitArguments(dataset=folder / "sloping", out=tmp_path, close_loop=True, reference=(folder / "plain",)))
-    [(out, (log, references, config))] = asked
+    [(out, (log, references, config, vehicle))] = asked
     assert (log.name, [one.name for one in references], out) == ("sloping", ["plain"], tmp_path / "close_loop")
-    assert config.seed == 0
+    assert (config.seed, config.with_effects, vehicle) == (0, (), None)
+    spec, params = day(0)
+    file = save_vehicle(tmp_path / "old.toml", replace(spec, wheelbase=0.7), params)
+    fit_main(FitArguments(dataset=folder / "sloping", out=tmp_path / "again", close_loop=True, vehicle=file,
+                          effects=("incline",)))
+    log, _, config, vehicle = asked[1][1]
+    assert config.with_effects == ("incline",) and log.spec.wheelbase == 0.7
+    assert describe(vehicle.params).keys() == describe(params).keys()
+
+
+def test_a_drive_counts_once_whatever_its_name_and_whichever_folder_it_lies_in(drives):
+    log, one, other = (drives[name] for name in ("plain", "reference_1", "reference_2"))
+    check_logs(log, (one, other))
+    with pytest.raises(ValueError, match="among the drives in question already"):
+        check_logs(log, (one, replace(other, sha256="other", trials=(*other.trials, replace(log.trials[0], name="x")))))
+    with pytest.raises(ValueError, match="among those of reference 1"):
+        check_logs(log, (one, replace(one, name="copy", sha256="other")))
 
 
 def test_finds_nothing_where_nothing_is(drives, sloping):
@@ -372,6 +388,11 @@ def test_the_command_writes_the_run(sloping, report, folder, tmp_path, monkeypat
     again = posterior(read(tmp_path / "run/evidence.json"), CONFIG.thresholds)
     assert (again.verdict, again.reason, again.weights) == ("named", report["reason"], report["weights"])
     assert "something unknown" in (tmp_path / "run/report.html").read_text()
+    slope = next(one for one in report["effects"] if one["name"] == "slope")["parameters"]["slope.along_x"]
+    low, high = load_intervals(tmp_path / "run/vehicle.toml")["slope.along_x"]  # of 90 %, as in all vehicle files
+    assert slope["interval"][0] < low < slope["value"] < high < slope["interval"][1]
+    assert high - low == pytest.approx(1.645 / 1.96 * np.diff(slope["interval"])[0], rel=1e-3)
+    assert load_vehicle(tmp_path / "run/vehicle.toml")[2]["interval_confidence"] == 0.9
     main(Arguments(dataset=folder / "sloping", reference=(folder / "plain",), vehicle=tmp_path / "run/vehicle.toml",
                    out=tmp_path / "again"))
     *_, vehicle, _ = asked[-1]

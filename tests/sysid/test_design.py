@@ -8,7 +8,7 @@ import pytest
 from conftest import UNICYCLE_SPACE, unicycle_plant
 
 import sysid.design as design_command
-from sysid.design import DesignConfig, main
+from sysid.design import DesignConfig, check_limits, main
 from sysid.errors.space import Space
 from sysid.intervals.design import (
     Subject,
@@ -203,6 +203,13 @@ def test_an_unknown_vehicle_ends_with_one_line(monkeypatch):
 
 
 @quick
+@pytest.mark.parametrize("option", ["v_max", "omega_max", "v_min"])
+def test_speeds_that_the_vehicle_does_not_drive_are_refused(option, tmp_path):
+    wanted = -9.0 if option == "v_min" else 9.0
+    with pytest.raises(ValueError, match=f"--{option.replace('_', '-')} {wanted:g}: whill_cr drives"):
+        check_limits(DesignConfig("whill_cr", tmp_path / "a.csv", **{option: wanted}), WHILL_CR)
+
+
 def test_a_room_that_every_drive_leaves_is_refused(monkeypatch):
     monkeypatch.setattr("sysid.intervals.design.driven_paths", lambda objective: [np.array([[0, 0], [99, 99.0]])] * 2)
     monkeypatch.setattr("sysid.intervals.design.library", lambda limits: candidates("straight", "turn", seconds=2.0))

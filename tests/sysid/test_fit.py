@@ -14,7 +14,8 @@ from sysid.logs.log import load_log
 from sysid.pages.fit_report import fit_dataset
 from sysid.pages.report import REPLAYS
 from sysid.replay.rollout import vehicle_plant
-from sysid.search.fitting import fit_log
+from sysid.search import fitting
+from sysid.search.fitting import fit_log, subject
 from sysid.search.settings import FitConfig
 from whill_mjx.logs.dataset import SensorNoise
 from whill_mjx.logs.manoeuvres import Scenario
@@ -129,6 +130,20 @@ def test_a_log_without_training_trials_is_an_error(planted):
     log = load_log(folder / "log").select(lambda trial: trial.held_out)
     with pytest.raises(ValueError, match="no training trial"):
         fit_log(log)
+
+
+def test_a_fit_to_one_channel_takes_only_drives_that_have_it(planted):
+    folder, _ = planted
+    log = load_log(folder / "log")
+    blind = dataclasses.replace(log.training[0], ground_truth=None)
+    config = FitConfig(channels="ground_truth")
+    mixed = dataclasses.replace(log, trials=(blind, *log.trials[1:]))
+    assert blind.name in subject(mixed, config)[0].notes[-1]
+    taken = fitting._training(mixed, config)
+    assert blind.name not in [one.name for one in taken]
+    assert all(one.odometry is None and one.ground_truth is not None for one in taken)
+    with pytest.raises(ValueError, match="--channels ground_truth: no training trial"):
+        fitting._training(dataclasses.replace(log, trials=(blind,)), config)
 
 
 def test_an_unknown_parameter_is_an_error(planted):

@@ -196,7 +196,7 @@ def test_the_loop_takes_parts_of_a_measured_set_and_its_reference_another(tmp_pa
     log, [reference], _ = load(given)
     assert (len(log.training), len(log.held_out), len(reference.training)) == (6, 3, 9)
     assert {trial.group for trial in reference.trials} == {"gravel"}
-    with pytest.raises(ValueError, match="the drives in question themselves"):
+    with pytest.raises(ValueError, match="among the drives in question already"):
         load(replace(given, reference_train=("warthog_sand_1",)))
     with pytest.raises(ValueError, match="Give --train"):
         load(Arguments(dataset=tmp_path))
