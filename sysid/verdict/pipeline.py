@@ -156,9 +156,9 @@ def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
         raise ValueError(f"log {log.name!r} has neither odometry nor an outside pose. Record one of them.")
-    seen = {content_of(trial): "the drives in question" for trial in log.trials}
+    seen = {content_of(trial): "the drives in question" for trial in log.trials if trial.command.table[:, 1:].any()}
     for number, other in enumerate(references):
-        mine = {content_of(trial): trial.name for trial in other.training}
+        mine = {content_of(trial): trial.name for trial in other.training if trial.command.table[:, 1:].any()}
         if again := [(name, seen[content]) for content, name in mine.items() if content in seen]:
             name, place = again[0]
             raise ValueError(f"reference {other.name!r} has {name!r}, which is among {place} already. Give drives of "

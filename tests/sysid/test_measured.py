@@ -20,7 +20,7 @@ pytestmark = pytest.mark.quick
 BLOCKS = ("cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_yaw", "imu_yaw")
 
 
-def write_drive(path, rows=3, update=5):
+def write_drive(path, rows=3, update=5, pace=1.0):
     """Windows of straight driving at 1 rad/s of both wheels (0.3 m/s), with the ICP held for `update` samples."""
     columns = [f"{name}_{i}" for name in BLOCKS for i in range(40)]
     data = np.zeros((rows, len(columns)))
@@ -28,7 +28,7 @@ def write_drive(path, rows=3, update=5):
     for i in range(40):
         for name in BLOCKS[:4]:
             data[:, index[f"{name}_{i}"]] = 1.0
-        data[:, index[f"icp_x_{i}"]] = 0.3 * 0.05 * (i // update * update)
+        data[:, index[f"icp_x_{i}"]] = 0.3 * 0.05 * pace * (i // update * update)
         data[:, index[f"imu_yaw_{i}"]] = 0.1
     np.savez(path, data=data, columns=np.array(columns))
 
@@ -189,8 +189,8 @@ def test_formats_are_told_apart_and_bad_calls_named(tmp_path):
 
 
 def test_the_loop_takes_parts_of_a_measured_set_and_its_reference_another(tmp_path):
-    for run in ("warthog_sand_1", "warthog_gravel"):
-        write_drive(tmp_path / f"{run}.npz", rows=9)
+    for run, pace in (("warthog_sand_1", 1.0), ("warthog_gravel", 0.9)):
+        write_drive(tmp_path / f"{run}.npz", rows=9, pace=pace)
     given = Arguments(dataset=tmp_path, train=("warthog_sand_1:0-0.6",), held_out=("warthog_sand_1:0.6-1",),
                       reference=(tmp_path,), reference_train=("warthog_gravel",))
     log, [reference], _ = load(given)
