@@ -42,7 +42,7 @@ flowchart LR
 
 | what all share | |
 |---|---|
-| exit code | 0 done, 1 a file or the machine is at fault, 2 the command is at fault, 130 stopped by a signal |
+| exit code | 0 done, 1 a file or the machine is at fault, 2 the command ([all](../reliability.md#exit-codes)) |
 | a mistake in an option | is named before anything is computed |
 | the same command again | long work goes on where it stopped ([what is promised](../reliability.md)) |
 | `make train`, `make test`, `make docs` | the same in a virtual environment that they make |

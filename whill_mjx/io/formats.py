@@ -31,7 +31,7 @@ class Format:
 
 FORMATS = {one.kind: one for one in (
     Format("driving-log-dataset", "dataset.toml", 1, "a driving log ([fields](log_format.md))"),
-    Format("micromobility-vehicle", "vehicle.toml", 1, "a vehicle ([fields](tasks.md))"),
+    Format("micromobility-vehicle", "vehicle.toml", 1, "a vehicle ([short form](howto/vehicle.md#a-short-toml-file))"),
     Format("micromobility-model", "model.toml", 1, "a fitted model of another kind ([models](models.md))"),
     Format("micromobility-policy", "policy.json", 1, "a policy of a vehicle ([fields](policy_file.md))"),
     Format("dreamer-onnx-policy", "policy.json", 1, "an agent of any observations ([fields](policy_file.md))"),
