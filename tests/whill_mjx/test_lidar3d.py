@@ -29,11 +29,11 @@ def scene_of(boxes=None, rounds=None, walls=None):
     return Scene(stack_boxes(boxes or [no_boxes(1)]), MARKER, default_looks(), solids=solids, walls=walls)
 
 
-def scanned(sensor, scene, qpos, twist=(0.0, 0.0)):
-    """Value of a sensor on a vehicle at qpos (7,) that moves with a twist (2,)."""
+def scanned(sensor, scene, qpos, twist=(0.0, 0.0), pose=(0.0, 0.0, 0.0)):
+    """Value of a sensor on a vehicle at qpos (7,) that moves with a twist (2,) about its reference point at a pose."""
 
     def measure(scene, qpos, twist):
-        vehicle, moment = SimpleNamespace(qpos=qpos), SimpleNamespace(twist=twist, scene=scene)
+        vehicle, moment = SimpleNamespace(qpos=qpos), SimpleNamespace(pose=jnp.asarray(pose), twist=twist, scene=scene)
         view = SimpleNamespace(state=SimpleNamespace(vehicle=vehicle), moment=moment)
         return sensor.measure((), view, jax.random.key(1))[1]
 
@@ -76,11 +76,11 @@ def test_the_level_ring_of_a_moving_scanner_is_the_level_scan(period):
     sensor = Lidar3D(rings=1, rays=90, lowest=0.0, highest=0.0, z=0.0, period=period, reach=9.0)
     level = quaternion_from_angles(jnp.zeros(()), jnp.zeros(()), pose[2])
     qpos = jnp.concatenate([pose[:2], jnp.array([0.5]), level])
-    value = scanned(sensor, scene, qpos, twist)
+    value = scanned(sensor, scene, qpos, twist, pose)
     assert value.shape == (1, 90, 2)
     angles = 2 * np.pi * ((np.arange(90) + 0.5) / 90 - 0.5)
-    x, y, yaw = sent_from(pose, twist, 90, period)
-    expected = jnp.minimum(jax.jit(first_hits, static_argnums=4)(scene, x, y, yaw + angles, 0.5), 9.0)
+    x, y, turn = sent_from(pose[:2], pose, twist, 90, period)
+    expected = jnp.minimum(jax.jit(first_hits, static_argnums=4)(scene, x, y, pose[2] + turn + angles, 0.5), 9.0)
     np.testing.assert_allclose(value[0, :, 0], expected, atol=1e-4)
     assert np.array_equal(value[0, :, 1] > 0, expected < 9.0)
 

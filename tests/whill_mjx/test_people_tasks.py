@@ -12,7 +12,10 @@ import pytest
 
 from whill_mjx.env import make_env, observe, reset_state, sense, step_state
 from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun
+from whill_mjx.gym import WhillEnv
+from whill_mjx.gym.kinds import info_names
 from whill_mjx.io.command_line import OptionError
+from whill_mjx.learning.setup import to_transition
 from whill_mjx.look import Look, main
 from whill_mjx.sensors.camera import Camera
 from whill_mjx.sensors.depth import Depth
@@ -22,7 +25,10 @@ from whill_mjx.tasks.corridor import Corridor
 from whill_mjx.tasks.follow import Follow
 from whill_mjx.tasks.terms import to_body
 from whill_mjx.vehicle.kinematics import reference_pose
+from whill_mjx.vehicle.types import TimeStep
 from whill_mjx.world.maps.walls import map_walls
+from whill_mjx.world.people.contact import scene_with_people
+from whill_mjx.world.people.crowd import scripted
 from whill_mjx.world.scene import no_boxes, stack_boxes
 
 quick, long = pytest.mark.quick, pytest.mark.long
@@ -105,6 +111,48 @@ def test_without_people_a_scene_and_its_program_have_none():
     assert state.scene.people is None and state.scene.solids is None
     _, outcome = jax.eval_shape(lambda state: step_state(env, params, state, jnp.zeros(2)), state)
     assert "bumped" not in outcome.metrics
+
+
+@dataclasses.dataclass(frozen=True)
+class Crossing(Corridor):
+    """Somebody comes from ahead and somebody from behind, a little later; it ends when both stand at the vehicle."""
+
+    action_repeat: int = 8
+
+    def sample_world(self, key):
+        world = super().sample_world(key)
+        people = scripted([[[2.5, 0.2], [-1.0, 0.2]], [[-2.1, -0.2], [3.0, -0.2]]], 1.3)
+        return dataclasses.replace(world, scene=scene_with_people(world.scene, people, key))
+
+    def endings(self, moment):
+        return {"met": moment.scene.people.held.all()}
+
+
+@quick
+def test_each_person_who_walks_into_the_vehicle_is_counted_once_in_whichever_period_of_a_step():
+    task = Crossing(layout="fixed")
+    env = WhillEnv(task, height=8, width=8)
+    still = np.array([2.0 * (0.0 - task.v_min) / (task.v_max - task.v_min) - 1.0, 0.0], np.float32)
+    counts, ended = [env.reset(seed=0)[1]["bumped"]], False
+    while not ended and len(counts) < 12:
+        _, _, ended, _, info = env.step(still)
+        counts.append(info["bumped"])
+    assert info["met"] is True and counts == [0.0, 0.0, 2.0]  # in two periods of the second step
+    assert env.step(still)[4]["bumped"] == 0.0  # nothing happens after the end
+
+
+@quick
+def test_counts_are_numbers_of_an_info_and_learners_read_the_count_of_the_episode():
+    metrics = {name: jnp.zeros(3) for name in ("x", "success", "bumped", "met")}
+    numbers, flags = info_names(metrics)
+    assert "bumped" in numbers and flags == ["success", "met"]
+    assert "bumped" not in info_names({"success": 0.0})[0]
+    people = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), scripted([[[0.0, 0.0], [1.0, 0.0]]] * 2, 1.0))
+    people = dataclasses.replace(people, held=jnp.array([[False, False], [True, False], [True, True]]))
+    flag = jnp.zeros(3, bool)
+    frame = TimeStep(jnp.zeros(3), jnp.zeros(3), flag, flag, flag, metrics)
+    np.testing.assert_array_equal(to_transition(frame, people).metrics["bumped"], [0.0, 1.0, 2.0])
+    assert "x" not in to_transition(frame, None).metrics
 
 
 @long

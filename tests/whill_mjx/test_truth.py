@@ -11,7 +11,10 @@ from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, repainted, reset_state, step_state
 from whill_mjx.learning.setup import TRUTH, functional_env, mirror_of
 from whill_mjx.sensors import privileged
+from whill_mjx.world.collision import obstacles_of, touches
+from whill_mjx.world.maps.walls import map_walls
 from whill_mjx.world.scene import box, footprint, no_boxes, stack_boxes
+from whill_mjx.world.solids import Solids, post, rod
 
 ENV, PARAMS = make_env("obstacle_course", "whill_cr", height=16, width=16)
 
@@ -58,6 +61,70 @@ def test_some_ray_meets_a_box_of_the_corridor_wherever_it_stands_ahead():
         far, aside, turned = rng.uniform(0.9, 2.9), rng.uniform(-0.5, 0.5), rng.uniform(-0.8, 0.8)
         boxes = stack_boxes([box(float(body.x) + far, aside, 0.4, 0.4, 0.45, jnp.ones(3), turned)])
         assert float(privileged.free_distances(body, boxes).min()) < far
+
+
+GREY = (0.5, 0.5, 0.5)
+STEP = 0.01
+"""Of the walk along each ray [m]."""
+ROUNDS = {
+    "post": (post(1.5, 0.1, 1.0, 0.2, GREY), True),
+    "low post": (post(1.5, 0.1, 0.15, 0.2, GREY), True),
+    "barrier": (rod((1.3, 0.6, 0.7), (1.8, -0.7, 0.75), 0.05, GREY, capsule=True), True),
+    "leaning pole": (rod((1.2, 0.5, 0.0), (1.8, 0.1, 2.0), 0.1, GREY, capsule=True), True),
+    "ball": (rod((1.4, -0.2, 0.3), (1.4, -0.2, 0.3), 0.25, GREY), True),
+    "high bar": (rod((1.3, 0.6, 1.6), (1.8, -0.7, 1.6), 0.05, GREY), False),
+}
+
+
+@pytest.fixture(scope="module")
+def beside_a_box():
+    """A state in which the axle is at the origin, the vehicle looks along x, and a box stands to its left."""
+    state = reset_state(ENV, PARAMS, jax.random.key(3))
+    qpos = state.vehicle.qpos.at[:7].set(jnp.array([-ENV.model.spec.reference_x, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]))
+    scene = dataclasses.replace(state.scene, boxes=stack_boxes([box(0.5, 2.0, 3.0, 0.4, 0.5, jnp.ones(3), 0.3)]))
+    return dataclasses.replace(state, scene=scene, vehicle=dataclasses.replace(state.vehicle, qpos=qpos))
+
+
+@pytest.fixture(scope="module")
+def walked():
+    """Function of a state to what is known and what a walk along each ray finds, both (RAYS,) m."""
+    known = jax.jit(lambda state: privileged.truth(ENV, state)[4:] * privileged.UNIT)
+    body = footprint(ENV.model.spec, 0.0, 0.0, 0.0)
+    far = np.arange(0.0, privileged.RANGE, STEP)
+
+    @jax.jit
+    def hits(scene):
+        def touched(angle, gone):
+            x, y = body.x + gone * jnp.cos(angle), body.y + gone * jnp.sin(angle)
+            small = {"half_length": jnp.array(STEP / 2), "half_width": jnp.array(STEP / 2)}
+            return touches(dataclasses.replace(body, x=x, y=y, **small), obstacles_of(scene, x, y))
+
+        along = jax.vmap(touched, in_axes=(None, 0))
+        return jax.vmap(along, in_axes=(0, None))(jnp.asarray(privileged.ANGLES), jnp.asarray(far))
+
+    def both(state):
+        held = np.asarray(hits(state.scene))
+        return np.asarray(known(state)), np.where(held.any(1), far[held.argmax(1)], privileged.RANGE)
+
+    return both
+
+
+@pytest.mark.parametrize("name", ROUNDS)
+def test_free_distances_end_where_the_vehicle_would_touch_posts_and_rods(walked, beside_a_box, name):
+    rounds, met = ROUNDS[name]
+    scene = dataclasses.replace(beside_a_box.scene, solids=Solids(rounds=rounds))
+    known, touched = walked(dataclasses.replace(beside_a_box, scene=scene))
+    # Where a ray grazes something, the small vehicle touches it earlier, or while the ray misses it.
+    assert np.mean(np.abs(known - touched) < 2 * STEP) > 0.9 and (touched <= known + STEP).all()
+    assert (known[0] < 1.5) == met
+
+
+def test_free_distances_end_at_a_wall_of_a_map_that_is_low(walked, beside_a_box):
+    walls = map_walls(np.array([[[1.6, 0.5], [1.6, -0.5]]], np.float32), keep=1, height=0.2)
+    boxes = stack_boxes([beside_a_box.scene.boxes, no_boxes(1)])
+    scene = dataclasses.replace(beside_a_box.scene, walls=walls, boxes=boxes)
+    known, touched = walked(dataclasses.replace(beside_a_box, scene=scene))
+    assert abs(known[0] - touched[0]) < 2 * STEP and known[0] == pytest.approx(1.6 + ENV.model.spec.reference_x)
 
 
 def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():

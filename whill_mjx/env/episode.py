@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.env.images import observe
-from whill_mjx.env.moments import endings_of, first_outcome, moment_of, pose_metrics, view_of
-from whill_mjx.env.records import TRAIL, Env, Outcome, State
+from whill_mjx.env.moments import endings_of, event_metrics, first_outcome, moment_of, pose_metrics, view_of
+from whill_mjx.env.records import EVENT_METRICS, TRAIL, Env, Outcome, State
 from whill_mjx.sensors.base import begin_sensors, read_sensors
 from whill_mjx.tasks.base import scale_action
 from whill_mjx.tasks.parts import BLUE
@@ -132,7 +132,9 @@ def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array)
     def repeat(carry, _):
         before, so_far = carry
         after, outcome = _control_period(env, params, before, command, unreadable)
-        outcome = dataclasses.replace(outcome, reward=so_far.reward + outcome.reward)
+        sums = {name: so_far.metrics[name] + value for name, value in outcome.metrics.items() if name in EVENT_METRICS}
+        reward = so_far.reward + outcome.reward
+        outcome = dataclasses.replace(outcome, reward=reward, metrics=outcome.metrics | sums)
         return jax.tree.map(lambda old, new: jnp.where(before.done, old, new), carry, (after, outcome)), None
 
     carry = (state, first_outcome(env, state))
@@ -170,7 +172,7 @@ def _control_period(
     ends = {name: flag.astype(reward.dtype) for name, flag in ends.items()}
     ends["time_s"] = jnp.where(after.done, step_count * jnp.array(env.model.config.control_dt, float), 0.0)
     ends["episode_return"] = jnp.where(after.done, after.episode_return, 0.0)
-    outcome = Outcome(reward, terminated, truncated, ends | pose_metrics(env, after))
+    outcome = Outcome(reward, terminated, truncated, ends | pose_metrics(env, after) | event_metrics(after))
     still = (state, first_outcome(env, state))  # after the end nothing moves, and the end is reported once
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
 

@@ -77,9 +77,11 @@ def view_of(env: Env, params: VehicleParams, state: State) -> View:
 
 
 def first_outcome(env: Env, state: State) -> Outcome:
-    """Outcome that goes with the first frame of an episode."""
+    """Outcome that goes with the first frame of an episode, and with every frame after its end."""
     false, zero = jnp.zeros((), bool), jnp.zeros(())
-    return Outcome(zero, false, false, dict.fromkeys(end_names(env, state), zero) | pose_metrics(env, state))
+    nothing = jax.tree.map(jnp.zeros_like, event_metrics(state))
+    ends = dict.fromkeys(end_names(env, state), zero)
+    return Outcome(zero, false, false, ends | pose_metrics(env, state) | nothing)
 
 
 def pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
@@ -93,10 +95,10 @@ def pose_metrics(env: Env, state: State) -> dict[str, jax.Array]:
         "omega": omega,
         "goal_distance": state.goal_distance,
         "clearance": free_distance(footprint(env.model.spec, x, y, yaw), state.scene),
-    } | _people_metrics(state)
+    }
 
 
-def _people_metrics(state: State) -> dict[str, jax.Array]:
-    """Count () of people who walked into the vehicle, which stood still, in the last period; of scenes with people."""
+def event_metrics(state: State) -> dict[str, jax.Array]:
+    """Counts () of what happened in the last control period: people who first walked into the vehicle."""
     people = state.scene.people
     return {} if people is None else {"bumped": jnp.sum(people.bumped).astype(jnp.float32)}

@@ -19,7 +19,9 @@ END_METRICS = ("success", "collision", "timeout", "diverged", "time_s", "episode
 """Metrics that are 0 except on the last frame of an episode; the endings of a task come on top (`end_names`)."""
 POSE_METRICS = ("x", "y", "yaw", "v", "omega", "goal_distance", "clearance")
 """Metrics of every frame."""
-RESERVED = (*POSE_METRICS, "bumped", "timeout", "diverged", "time_s", "episode_return")
+EVENT_METRICS = ("bumped",)
+"""Counts of what happened since the previous step; 0 on the first frame of an episode and after its end."""
+RESERVED = (*POSE_METRICS, *EVENT_METRICS, "timeout", "diverged", "time_s", "episode_return")
 """Names that a task's endings may not have."""
 TRAIL = 5
 """Poses kept for late images and for the lag of the exposure control."""

@@ -16,21 +16,19 @@ import gymnasium
 import jax
 import numpy as np
 
-from whill_mjx.env import POSE_METRICS
 from whill_mjx.gym.kinds import Carried, Kind, as_actions, check_process, condition_of, find_kind, info_names
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.tasks.tasks import TASKS, Task
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
-INFO = POSE_METRICS
-
 
 class WhillEnv(Carried, gymnasium.Env):
     """A task as a `gymnasium.Env`: actions (2,) in [-1, 1] in, an image (64, 64, 3) uint8 or a dict of sensors out.
 
-    `info` holds x, y [m], yaw [rad] of the driven-axle centre, v [m/s], omega [rad/s], goal_distance, clearance [m] and
-    the flags success, collision, diverged, and those of the task's other endings. It can be pickled and copied.
+    `info` holds x, y [m], yaw [rad] of the driven-axle centre, v [m/s], omega [rad/s], goal_distance, clearance [m],
+    the flags success, collision, diverged, and those of the task's other endings. Among people, the number `bumped`
+    counts who walked into the vehicle since the last step. It can be pickled and copied.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.batch import BatchEnv, BatchState, make_batch
-from whill_mjx.env import POSE_METRICS, make_env, observe
+from whill_mjx.env import EVENT_METRICS, POSE_METRICS, make_env, observe
 from whill_mjx.evaluation.conditions import NAMES, Condition, begin_under, nominal
 from whill_mjx.io.fields import CONDITION, check, shown
 from whill_mjx.vehicle.types import TimeStep
@@ -264,7 +264,8 @@ def as_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def info_names(metrics: Mapping[str, Any]) -> tuple[list[str], list[str]]:
     """Names of the numbers and of the flags of an `info`."""
-    return list(POSE_METRICS), [name for name in metrics if name not in (*POSE_METRICS, *COUNTED)]
+    numbers = [*POSE_METRICS, *(name for name in EVENT_METRICS if name in metrics)]
+    return numbers, [name for name in metrics if name not in (*numbers, *COUNTED)]
 
 
 def _after_fork() -> None:

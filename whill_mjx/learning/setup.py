@@ -29,6 +29,7 @@ from whill_mjx.sensors import privileged
 from whill_mjx.tasks.tasks import Budget, Task, make_task
 from whill_mjx.vehicle.types import TimeStep
 from whill_mjx.vehicle.vehicle_file import load_intervals
+from whill_mjx.world.people.crowd import People
 from whill_mjx.world.randomize import Variation, read_variation
 
 PAINTS = 15
@@ -247,9 +248,11 @@ def _alike(value: Any, default: Any) -> bool:
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 
-def to_transition(step: TimeStep) -> Transition:
-    """A time step as the learner reads it."""
+def to_transition(step: TimeStep, people: People | None) -> Transition:
+    """A time step as a learner reads it: its metrics are of the episode so far, and learners log the last ones."""
     metrics = {name: value for name, value in step.metrics.items() if name not in POSE_METRICS}
+    if people is not None:
+        metrics["bumped"] = people.held.sum(-1).astype(jnp.float32)
     ended = step.terminated | step.truncated
     return Transition(step.obs, step.reward, step.first, ended, step.terminated, metrics)
 
@@ -270,7 +273,7 @@ def functional_env(
     seconds = batch.env.model.config.control_dt * task.action_repeat
 
     def emit(state: Any, step: TimeStep) -> Transition:
-        transition = to_transition(step)
+        transition = to_transition(step, state.env.scene.people)
         if not targets:
             return transition
         known = jax.vmap(lambda one: privileged.truth(batch.env, one))(state.env)

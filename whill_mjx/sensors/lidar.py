@@ -61,9 +61,9 @@ class Lidar(Sensor):
     def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
         body, moment = view.moment.body, view.moment
         c, s = jnp.cos(body.yaw), jnp.sin(body.yaw)
-        pose = jnp.stack([body.x + self.x * c - self.y * s, body.y + self.x * s + self.y * c, body.yaw])
-        x, y, yaw = sent_from(pose, moment.twist, self.rays, self.period)
-        found = first_hits(moment.scene, x, y, yaw + self.angles(), self.z)
+        place = jnp.stack([body.x + self.x * c - self.y * s, body.y + self.x * s + self.y * c])
+        x, y, turn = sent_from(place, moment.pose, moment.twist, self.rays, self.period)
+        found = first_hits(moment.scene, x, y, body.yaw + turn + self.angles(), self.z)
         if not (self.noise or self.dropouts or self.nearest):
             return memory, jnp.minimum(found, self.reach)
         return memory, disturbed(found, key, self.noise, self.dropouts, self.nearest, self.reach)

@@ -69,16 +69,14 @@ class Lidar3D(Sensor):
         return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(raised) + 0.0 * azimuth], -1)
 
     def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
-        qpos, twist = view.state.vehicle.qpos, view.moment.twist
+        qpos, moment = view.state.vehicle.qpos, view.moment
         rotation = rotation_from_quaternion(qpos[3:7])
-        yaw = jnp.arctan2(rotation[1, 0], rotation[0, 0])
-        at = rotation @ jnp.array([self.x, self.y, self.z])
-        x, y, then = sent_from(jnp.stack([qpos[0], qpos[1], yaw]), twist, self.rays, self.period)
-        back = then - yaw  # (rays,) by which the vehicle was turned less when a ray was sent
-        c, s, zero = jnp.cos(back), jnp.sin(back), jnp.zeros(self.rays)
-        turn = jnp.stack([jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.stack([zero, zero, zero + 1.0])])
-        origin = jnp.stack([x, y, zero + qpos[2]], -1) + jnp.einsum("ijr,j->ri", turn, at)
-        way = jnp.einsum("ijr,jk,nrk->nri", turn, rotation, jnp.asarray(self.directions(), jnp.float32))
+        place = qpos[:3] + rotation @ jnp.array([self.x, self.y, self.z])
+        x, y, turn = sent_from(place[:2], moment.pose, moment.twist, self.rays, self.period)
+        c, s, zero = jnp.cos(turn), jnp.sin(turn), jnp.zeros(self.rays)
+        turned = jnp.stack([jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.stack([zero, zero, zero + 1.0])])
+        origin = jnp.stack([x, y, zero + place[2]], -1)
+        way = jnp.einsum("ijr,jk,nrk->nri", turned, rotation, jnp.asarray(self.directions(), jnp.float32))
         origin = jnp.broadcast_to(origin, way.shape)
         found = first_returns(view.moment.scene, origin.reshape(-1, 3), way.reshape(-1, 3))
         far = disturbed(found.distance, key, self.noise, self.dropouts, self.nearest, self.reach)

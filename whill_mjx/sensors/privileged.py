@@ -6,6 +6,7 @@ in `RAYS` directions. Lengths are in units of `UNIT`, so that the learner's syml
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -16,11 +17,13 @@ import numpy as np
 from whill_mjx.sensors.base import Reading, Sensor, View
 from whill_mjx.sensors.lidar import distances
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
+from whill_mjx.world.collision import from_above
 from whill_mjx.world.lidar import first_hits
-from whill_mjx.world.scene import Boxes, Footprint, footprint
+from whill_mjx.world.scene import Boxes, Footprint, Scene, footprint
+from whill_mjx.world.solids import Rounds, Solids
 
 UNIT = 0.1  # m
-HEIGHT = 0.3  # m, at which walls of a map and people are met
+HEIGHT = 0.3  # m, at which walls of a map are met, and lower ones at their edge
 RANGE = 5.0  # m, largest free distance
 RAYS = 48  # 3 m away they lie 0.39 m apart: at least one meets a box as wide as the corridor's
 SIZE = 4 + RAYS
@@ -52,10 +55,39 @@ def truth(env: Any, state: Any) -> jax.Array:
     ahead, aside = dx * jnp.cos(yaw) + dy * jnp.sin(yaw), dy * jnp.cos(yaw) - dx * jnp.sin(yaw)
     near = jnp.stack([ahead, aside, v, omega]) / UNIT
     free = free_distances(body, state.scene.boxes)
-    if state.scene.walls is not None or state.scene.people is not None:  # neither is a box
-        there = first_hits(state.scene, body.x, body.y, body.yaw + ANGLES, HEIGHT)
+    if state.scene.walls is not None or rounds_of(state.scene) is not None:  # neither is a box
+        height = HEIGHT if state.scene.walls is None else min(HEIGHT, state.scene.walls.height)
+        there = first_hits(in_plane(state.scene, body, height), body.x, body.y, body.yaw + ANGLES, height)
         free = jnp.minimum(free, there)
     return jnp.concatenate([near, free / UNIT]).astype(jnp.float32)
+
+
+def rounds_of(scene: Scene) -> Rounds | None:
+    """Cylinders and capsules of a scene, people among them; None without any."""
+    return None if scene.solids is None else scene.solids.rounds
+
+
+def in_plane(scene: Scene, body: Footprint, height: float) -> Scene:
+    """The scene, of whose rounds each lies in the plane at `height` [m] as the capsule that the vehicle can run into.
+
+    A contact does not ask how high a post is, nor at which height a rod hangs, if the vehicle does not pass below it.
+    """
+    rounds = rounds_of(scene)
+    if rounds is None:
+        return scene
+    seen = from_above(rounds)
+    reach = (seen.end - seen.start) / 2
+    half = jnp.sqrt(jnp.sum(reach**2, -1))
+    axis = jnp.where(half[:, None] > 1e-6, reach / jnp.maximum(half, 1e-6)[:, None], jnp.array([1.0, 0.0]))
+    lying = dataclasses.replace(
+        rounds,
+        centre=jnp.pad((seen.start + seen.end) / 2, ((0, 0), (0, 1)), constant_values=height),
+        axis=jnp.pad(axis, ((0, 0), (0, 1))),
+        half=half,
+        capsule=jnp.ones_like(rounds.capsule),
+        mask=seen.mask & (seen.low < body.height),
+    )
+    return dataclasses.replace(scene, solids=Solids(rounds=lying))
 
 
 def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:

@@ -24,19 +24,33 @@ CLOSE = 1e-3
 """Distance at which a traced ray has arrived [m]."""
 
 
-def sent_from(pose: jax.Array, twist: jax.Array, rays: int, period: float) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """x, y [m] and yaw [rad], each (rays,), of a moving scanner when each ray of a scan was sent; the first is oldest.
+def sent_from(
+    place: jax.Array, pose: jax.Array, twist: jax.Array, rays: int, period: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """x, y [m] and turn [rad], each (rays,), of a scanner when each ray of a scan was sent; the first is oldest.
+
+    The vehicle's reference point goes along an arc, and the scanner, which is fixed to the vehicle, turns around it.
+    `turn` is the vehicle's yaw less its yaw when the scan ends.
 
     Args:
-        pose: (3,) x [m], y [m], yaw [rad] when the scan ends.
-        twist: (2,) the scanner's speed ahead [m/s] and its yaw rate [rad/s].
+        place: (2,) x, y of the scanner when the scan ends [m].
+        pose: (3,) x [m], y [m], yaw [rad] of the reference point then.
+        twist: (2,) speed ahead of the reference point [m/s], and yaw rate [rad/s].
         rays: number of rays.
         period: duration of the scan [s]; 0 is a scan at one moment.
     """
+    if period == 0.0:
+        still = jnp.zeros(rays)
+        return place[0] + still, place[1] + still, still
     age = period * (1.0 - (jnp.arange(rays) + 1.0) / rays)
-    middle = pose[2] - twist[1] * age / 2  # an arc is left in the direction of its middle
-    back = age * twist[0]
-    return pose[0] - back * jnp.cos(middle), pose[1] - back * jnp.sin(middle), pose[2] - twist[1] * age
+    turn = -twist[1] * age
+    chord = age * twist[0] * jnp.sinc(turn / (2 * jnp.pi))
+    middle = pose[2] + turn / 2  # a chord has the direction of its arc's middle
+    c, s = jnp.cos(turn), jnp.sin(turn)
+    arm = place - pose[:2]
+    x = place[0] - chord * jnp.cos(middle) + (c - 1.0) * arm[0] - s * arm[1]
+    y = place[1] - chord * jnp.sin(middle) + s * arm[0] + (c - 1.0) * arm[1]
+    return x, y, turn
 
 
 def disturbed(
