@@ -21,6 +21,7 @@ import numpy as np
 
 from sysid.replay.models import Parameters, Twin, describe_parameters, with_effects
 from sysid.replay.robot import Robot
+from sysid.replay.robot_contacts import tyre_places
 from sysid.replay.robot_parameters import Entry, Overlaid
 from sysid.replay.robot_servos import ROTOR_SHARE
 from sysid.replay.robot_sizes import Size
@@ -140,7 +141,7 @@ def _root(robot: Robot) -> int:
 def _ahead(robot: Robot, places: np.ndarray) -> np.ndarray:
     """How far places (K, 3) in the room are ahead of the middle of the driven wheels, at rest [m]."""
     data = _rested(robot)
-    return (places - data.xanchor[list(robot.joints)].mean(0)) @ _axes(robot, data)[0]
+    return (places - tyre_places(robot.host, data, robot.joints).mean(0)) @ _axes(robot, data)[0]
 
 
 def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.ndarray, float]:
@@ -149,7 +150,7 @@ def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.nda
     host, data = robot.host, _rested(robot)
     model: Any = Overlaid(host, arrays)
     bodies = np.flatnonzero(host.body_rootid == _root(robot))
-    middle = data.xanchor[list(robot.joints)].mean(0)
+    middle = tyre_places(host, data, robot.joints).mean(0)
     masses, places = model.body_mass[bodies], (data.xipos[bodies] - middle) @ _axes(robot, data).T
     mass = float(masses.sum())
     centre = masses @ places / mass
@@ -165,7 +166,7 @@ def extent_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == _root(robot))
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     middle = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, host.geom_aabb[geoms, :3])
-    middle = (middle - data.xanchor[list(robot.joints)].mean(0)) @ axes.T
+    middle = (middle - tyre_places(host, data, robot.joints).mean(0)) @ axes.T
     reach = np.einsum("gij,gj->gi", np.abs(axes @ turns), host.geom_aabb[geoms, 3:])
     return (middle - reach).min(0), (middle + reach).max(0)
 
