@@ -66,7 +66,8 @@ def vehicle_of(
                    wheel_inertia=robot.spin, body_length=length, body_width=width, body_height=height)
     (tyre, wheels), (ball, balls) = (
         _friction(robot, entries, values, geoms) for geoms in (_tyres(robot), robot.sliding))
-    gain = float(abs(robot.host.actuator_gainprm[robot.actuators[0], 0])) if robot.motors else 1.0
+    host, motor = robot.host, robot.actuators[0]
+    gain = float(abs(host.actuator_gear[motor, 0] * host.actuator_gainprm[motor, 0])) if robot.motors else 1.0
     found = {
         "body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
         "body.com_y": com[1], "body.com_z": com[2],

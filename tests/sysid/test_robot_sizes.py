@@ -1,13 +1,20 @@
-"""Robot files: the track is that of the tyres, sides are those on which wheels stand, numbers are finite."""
+"""Robot files: the track is that of the tyres, sides are those on which wheels stand, and servos turn behind gears."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
 import pytest
 from test_robots import BALL, CYLINDER, joint, link, robot_file, wheel
 
-from sysid.replay.mjcf import mjcf_model
+from sysid.replay.mjcf import Stepped, mjcf_model
 from sysid.replay.robot_check import check_robot, describe_robot
+from sysid.replay.robot_drive import RobotDrive
 from sysid.replay.robot_loading import load_robot
+from sysid.replay.robot_servos import is_stable
 from whill_mjx.vehicle.parameters import get_values
 from whill_mjx.vehicle.specs import SPECS, in_proportion
 
@@ -89,3 +96,82 @@ def test_numbers_of_a_urdf_that_are_not_finite_are_refused(tmp_path, old, new, s
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(ValueError, match=f"{path}: {said}; it must be made of finite numbers. Correct it."):
         load_robot(path)
+
+
+CART = """<mujoco><option integrator="implicitfast"/><worldbody><geom type="plane" size="5 5 0.1"/>
+  <body name="base" pos="0 0 0.1"><freejoint/><inertial pos="-0.08 0 0.02" mass="5" diaginertia="0.1 0.1 0.1"/>
+    <geom name="ball" type="sphere" size="0.05" pos="-0.2 0 -0.05" friction="0.01" priority="1"/>
+    <body name="left_wheel" pos="0 0.2 0"><joint name="left" axis="0 1 0"/><geom type="sphere" size="0.1" mass="0.5"/>
+    </body><body name="right_wheel" pos="0 -0.2 0"><joint name="right" axis="0 1 0"/>
+      <geom type="sphere" size="0.1" mass="0.5"/></body></body></worldbody><actuator>ACTS</actuator></mujoco>"""
+
+
+def cart_file(folder, acts):
+    """A cart whose wheels are turned by actuators of this form."""
+    path = folder / "cart.xml"
+    path.write_text(CART.replace("ACTS", "".join(acts.format(side) for side in ("left", "right"))))
+    return path
+
+
+SERVOS = [
+    '<velocity joint="{}" kv="0.5" gear="-1"/>', '<velocity joint="{}" kv="0.1" gear="10"/>',
+    '<general joint="{}" gainprm="5" biastype="affine" biasprm="0 0 -1"/>',
+    '<general joint="{}" gear="-4" gainprm="-5" biastype="affine" biasprm="0 0 -0.3"/>',
+]
+MOTORS = ['<motor joint="{}" gear="-1"/>', '<motor joint="{}" gear="20" ctrlrange="-3 3"/>',
+          '<general joint="{}" gear="-2" gainprm="-5"/>']
+
+
+@pytest.mark.parametrize("acts", [*SERVOS, *MOTORS])
+def test_wheels_turn_as_commanded_behind_any_gear(tmp_path, acts):
+    robot = load_robot(cart_file(tmp_path, acts))
+    check = check_robot(robot)
+    assert not robot.added and robot.motors == (acts in MOTORS)
+    assert check.speed == pytest.approx(check.command[0], rel=0.03)
+    assert check.rate == pytest.approx(check.command[1], rel=0.03)
+
+
+@pytest.mark.parametrize("acts", [*SERVOS, *MOTORS])
+def test_mjx_and_c_mujoco_pull_the_wheels_alike(tmp_path, acts, monkeypatch):
+    robot, kp, command = load_robot(cart_file(tmp_path, acts)), 0.4, np.array([0.3, 0.5])
+    stepped, seen = Stepped(robot, {}), []
+    monkeypatch.setattr(stepped, "mjx", SimpleNamespace(step=lambda model, data: (seen.append(data.ctrl), data)[1]))
+    params = SimpleNamespace(values={"drive.kp": kp})
+    state = stepped.place(params, np.array([0.0, 0.0, 0.0, 0.1, -0.2]))
+    stepped.substep(params, state, command)
+    drive = RobotDrive(robot, {})
+
+    def torques(model, ctrl):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state.qpos, state.qvel, ctrl
+        mujoco.mj_forward(model, data)
+        return data.qfrc_actuator[list(robot.wheels)]
+
+    pulled = torques(robot.host, np.asarray(seen[0]))
+    assert pulled == pytest.approx(torques(drive.model(0, {"drive.kp": kp}), drive.controls(command)), rel=1e-4)
+    lag = (command[0] + np.array([-1, 1]) * command[1] * robot.track / 2) / 0.1 - np.asarray(state.qvel)[-2:]
+    assert (np.sign(pulled) == np.sign(lag)).all()
+
+
+def test_a_servo_is_as_stiff_as_its_gear_squared_makes_it(tmp_path):
+    host = load_robot(cart_file(tmp_path, '<velocity joint="{}" kv="0.1" gear="10"/>')).host
+    stiffness = 0.1 * 10**2 * host.opt.timestep
+    inertias = [[(share * stiffness, 1.0)] * 2 for share in (0.9, 1.1)]
+    assert [is_stable(host, ("left", "right"), one) for one in inertias] == [False, True]
+
+
+def test_a_fitted_gain_scales_a_servo_whose_command_is_no_speed(tmp_path):
+    path = cart_file(tmp_path, SERVOS[2])
+    path.write_text(path.read_text().replace("<general ", '<general name="left_servo" ', 1))
+    model = mjcf_model(path, {"actuator.left_servo.gain": (1.0, 50.0)})
+    written = mujoco.MjModel.from_xml_path(str(model.write(tmp_path, replace(model.params, values={
+        "actuator.left_servo.gain": np.array(10.0)}))))
+    assert written.actuator("left_servo").gainprm[0] == 10.0 and written.actuator("left_servo").biasprm[2] == -2.0
+
+
+def test_a_robot_that_drives_backwards_is_named(tmp_path):
+    robot = load_robot(cart_file(tmp_path, SERVOS[1]))
+    check = check_robot(robot)
+    lines = describe_robot(robot, replace(check, speed=-check.speed))
+    assert any("it drives backwards" in line for line in lines)
+    assert not any("it drives backwards" in line for line in describe_robot(robot, check))
