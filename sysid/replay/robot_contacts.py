@@ -134,9 +134,9 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
             spec.delete(geom)
         for geom in one.find_all("geom"):
             geom.contype, geom.conaffinity = 0, 0
+        place = host.jnt_pos[joint] + along * host.jnt_axis[joint]
         one.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0.0, 0.0], contype=0, conaffinity=1, mass=0.0,
-                     pos=host.jnt_pos[joint] + along * host.jnt_axis[joint], solref=FIRM_TIME, solimp=FIRM, solmix=ALONE,
-                     name=one.name)
+                     pos=place, solref=FIRM_TIME, solimp=FIRM, solmix=ALONE, name=one.name)
         what = "has rollers, which are left out" if rollers else "is no cylinder or sphere" if shapes else (
             "has its shape on another link")
         notes.append(f"{path.name}: wheel {one.name} {what}: it rolls on the {radius:.4g} m by which it reaches from "

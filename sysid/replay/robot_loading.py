@@ -135,7 +135,8 @@ def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timeste
     except ValueError as error:
         missing = "; ".join(note for note in notes if note.endswith("left out"))
         raise ValueError(f"{error}{f' ({missing}.)' if missing else ''}") from None
-    notes += [*swapped(path, spec, wheels, joints), *as_plain_wheels(path, spec, joints, file.drive), *_with_weight(path, spec)]
+    notes += [*swapped(path, spec, wheels, joints), *as_plain_wheels(path, spec, joints, file.drive),
+              *_with_weight(path, spec)]
     if stated is not None:
         if len(joints) == 2:  # the file has none
             spec.option.impratio, spec.option.cone = STIFF, mujoco.mjtCone.mjCONE_ELLIPTIC

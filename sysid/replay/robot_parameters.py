@@ -86,7 +86,8 @@ class Entry:
             found[self.array] = put(found[self.array], 0, -value)
         for column in self.servo:
             ratio = model.actuator_biasprm[rows, column] / model.actuator_gainprm[rows, 0]  # -1, but for <general>
-            found["actuator_biasprm"] = put(found.get("actuator_biasprm", model.actuator_biasprm), column, value * ratio)
+            bias = found.get("actuator_biasprm", model.actuator_biasprm)
+            found["actuator_biasprm"] = put(bias, column, value * ratio)
         return found
 
 

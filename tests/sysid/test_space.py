@@ -11,8 +11,10 @@ import pytest
 from benchmarks.planted_logs import Schedule, fitted_plant, write_dataset
 from sysid.errors.space import RATIO, Space, make_space, searched
 from sysid.logs.log import load_log
+from sysid.missing.catalogue import hypotheses
 from sysid.replay.differences import make_replay
 from sysid.replay.models import measured_effects, with_effects
+from whill_mjx.effects import EFFECTS
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.presets import in_short, preset_params
 from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR, find_spec, in_proportion
@@ -139,11 +141,37 @@ def test_a_fit_gives_a_differential_drive_with_slip_losses_that_rise_with_speed(
 def test_what_a_fit_may_find_of_a_vehicle_can_be_read_again(tmp_path, like, kind, mass, radius, track, wheelbase):
     spec = in_proportion(find_spec(like), "vehicle", radius, track, wheelbase, mass)
     params = in_short(spec, kind)
-    space = make_space(params, spec, list(describe(params)))
+    have = {effect.name for effect in params.effects}
+    params = with_effects(params, [name for name in EFFECTS if name not in have])
+    names = list(describe(params))
+    names = [name for name, value in zip(names, get_values(params, names), strict=True) if np.isfinite(value)]
+    space = make_space(params, spec, names)
     for name, values in (("start", space.initial), ("low", space.low), ("high", space.high)):
         written = set_values(params, space.names, jnp.asarray(values))
         read = load_vehicle(save_vehicle(tmp_path / f"{name}.toml", spec, written))[1]
         np.testing.assert_array_equal(get_values(read, space.names), get_values(written, space.names))
+
+
+@pytest.mark.quick
+def test_forces_and_sizes_that_are_looked_for_follow_the_vehicle():
+    """A vehicle of an eighth of the chair's lengths: 1/512 of its mass."""
+    small = in_proportion(WHILL_CR, "small", 0.1325 / 8, 0.496 / 8, 0.6 / 8, 52.0 / 512)
+    names = ["torque_saturation.limit", "side_force.sideways", "supply_sag.per_watt", "rolling_resistance.mu_r"]
+    found, hypothesis = {}, {}
+    for spec in (WHILL_CR, small):
+        params = preset_params(spec, "physical")
+        hypothesis[spec.name] = {one.key: one for one in hypotheses(spec, params)}
+        params = with_effects(params, ["torque_saturation", "side_force", "supply_sag"])
+        params = set_values(params, ["torque_saturation.limit"], jnp.asarray([spec.mass]))
+        space = make_space(params, spec, names)
+        found[spec.name] = np.stack([space.low, space.high])
+    np.testing.assert_array_equal(found["whill_cr"], [[5.0, -300.0, 0.0, 0.0], [3000.0, 300.0, 0.02, 0.08]])
+    np.testing.assert_allclose(found["small"], found["whill_cr"] * [1 / 512, 1 / 512, 512, 1], rtol=1e-9)
+    chair, other = hypothesis.values()
+    assert chair["supply_sag/power"].axes[0].unit == 0.0006
+    assert dict(chair["payload_shift"].constants) == {"payload_shift.z": 0.3}
+    assert other["supply_sag/power"].axes[0].unit == pytest.approx(0.0006 * 512)
+    assert dict(other["payload_shift"].constants)["payload_shift.z"] == pytest.approx(0.3 / 8)
 
 
 @pytest.mark.quick

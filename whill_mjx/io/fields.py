@@ -307,9 +307,8 @@ VALUE = (
 INTERVAL = Field("interval", kind="numbers", count=2, exceptions=(-math.inf, math.inf))
 
 SIZE = {field.name: field for field in SIZES}
-MASSES = (SIZE["mass"].low / 52.0, SIZE["mass"].high / 52.0)
-LENGTHS = (SIZE["wheel_radius"].low / 0.1325, SIZE["wheel_radius"].high / 0.1325)
-"""The smallest and the largest vehicle of a file over the chair, for which the ranges of cards are."""
+CHAIR = (52.0, 0.1325)
+"""Mass [kg] and wheel radius [m] of the vehicle for which the ranges of parameters are stated."""
 GROWTH = {
     "kg": (1, 0), "N": (1, 0), "N s/m": (1, 0), "N s^2/m^2": (1, 0), "N m": (1, 1), "N m s/rad": (1, 2),
     "N m/rad": (1, 2), "kg m^2": (1, 2), "1/W": (-1, 0), "s/kg": (-1, 0),
@@ -335,6 +334,13 @@ RANGES: dict[str, tuple[float, float]] = {
 """Widest sensible range of a parameter of a vehicle file, where it is not the usual one of `parameter_field`."""
 
 
+def growth(unit: str, mass: float, wheel_radius: float) -> float:
+    """How many times larger than the chair's a parameter of a unit is on a vehicle that is built alike; 1 for the
+    chair."""
+    powers = GROWTH.get(unit, (0, 0))
+    return float((mass / CHAIR[0]) ** powers[0] * (wheel_radius / CHAIR[1]) ** powers[1])
+
+
 def parameter_field(name: str, unit: str, low: float, high: float, neutral: float) -> Field:
     """The field of a parameter of a vehicle: ten times beyond the range that a fit may search, and the neutral value.
 
@@ -344,8 +350,8 @@ def parameter_field(name: str, unit: str, low: float, high: float, neutral: floa
         name: dotted, such as "pid_drive.kp".
         unit, low, high, neutral: of its `Parameter`.
     """
-    mass, length = GROWTH.get(unit, (0, 0))
-    smaller, larger = sorted(MASSES[end] ** mass * LENGTHS[end] ** length for end in (0, 1))
+    mass, radius = SIZE["mass"], SIZE["wheel_radius"]
+    smaller, larger = sorted((growth(unit, mass.low, radius.low), growth(unit, mass.high, radius.high)))
     reach = 10.0 * larger * max(abs(low), abs(high))
     lowest, highest = (-reach if low < 0 else low * smaller / 10.0), (reach if high > 0 else 0.0)
     lowest, highest = RANGES.get(name, (lowest, highest))
