@@ -187,7 +187,7 @@ def _ground(draft: _Draft, radius: float) -> None:
     """Put the robot on a floor, without contacts that would lift its wheels and those that MJX lacks."""
     path, spec, bodies = draft.path, draft.spec, draft.bodies
     if not (draft.host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
-        bottom = float(draft.data.xpos[bodies[0], 2]) - radius_of(path, draft.host, bodies[0], radius)
+        bottom = float(draft.data.xanchor[draft.ids[0], 2]) - radius_of(path, draft.host, bodies[0], radius)
         taken = {geom.name for geom in spec.geoms}
         name = next(one for one in ("floor", *(f"floor_{k}" for k in range(len(taken) + 1))) if one not in taken)
         spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom],

@@ -175,3 +175,22 @@ def test_a_robot_that_drives_backwards_is_named(tmp_path):
     lines = describe_robot(robot, replace(check, speed=-check.speed))
     assert any("it drives backwards" in line for line in lines)
     assert not any("it drives backwards" in line for line in describe_robot(robot, check))
+
+
+def test_the_floor_that_is_added_lies_under_the_wheels_wherever_their_bodies_begin(tmp_path):
+    """As CAD programs write it: all bodies begin at one point, and joints and shapes are where they are."""
+    path = cart_file(tmp_path, SERVOS[1])
+    plain = path.read_text().replace('<geom type="plane" size="5 5 0.1"/>', "")
+    path.write_text(plain)
+    usual = load_robot(path)
+    shifted = plain.replace('pos="-0.08 0 0.02"', 'pos="-0.08 0 -0.28"').replace('pos="-0.2 0 -0.05"',
+                                                                                 'pos="-0.2 0 -0.35"')
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        shifted = shifted.replace(f'pos="0 {y} 0"><joint name="{side}"', f'><joint name="{side}" pos="0 {y} -0.3"')
+    path.write_text(shifted.replace('<geom type="sphere" size="0.1"', '<geom type="sphere" size="0.1" pos="0 Y -0.3"')
+                    .replace("Y", "0.2", 1).replace("Y", "-0.2", 1).replace('pos="0 0 0.1"', 'pos="0 0 0.4"'))
+    robot = load_robot(path)
+    assert robot.distance == pytest.approx(usual.distance)
+    check = check_robot(robot)
+    assert check.speed == pytest.approx(check_robot(usual).speed, rel=1e-3)
+    assert robot.rest[2] - usual.rest[2] == pytest.approx(0.3, abs=1e-3)
