@@ -40,7 +40,8 @@ A vehicle is a spec, a mass distribution and a tuple of effects. Each effect act
 vanishes to the last bit (the two drives, `pid_drive` and `torque_drive`, then give no force).
 
 Each table lists the parameters with their unit, the usual values on a real vehicle, the range that a fit may search,
-and the neutral value. A source "estimate" is an engineering range without a published number behind it.
+and the neutral value. The range is the chair's: on another vehicle masses, forces and torques go with its mass and
+wheel radius. A source "estimate" is an engineering range without a published number behind it.
 
     python -m whill_mjx.drive --manoeuvre figure_eight --effects yaw_scrub:torque=6 slope:along_x=0.02 --out DATASET
 

@@ -12,7 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from sysid.replay.arrays import namespace
+from whill_mjx.io.fields import growth, parameter_field
 from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import Parameter
 
 STEP = 0.01  # half the distance between the two ends of a difference, as a share of the parameter's range
 
@@ -149,6 +151,7 @@ class Space:
 # Factors on the starting value, for what a preset scales with the vehicle, from 3 kg to 300 kg.
 FACTORS = {"body.yaw_inertia": (1 / 4, 4.0), "torque_drive.kp": (1 / 30, 30.0), "torque_drive.ki": (0.0, 20.0),
            "torque_drive.limit": (1 / 10, 30.0)}
+ROUNDING = 1e-6  # share by which single precision may round a bound out of what a file may hold
 LOSS = 1.5  # 1/s by which bearings may brake a vehicle that rolls, or a feed-forward make up for it
 
 
@@ -182,8 +185,8 @@ def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
 
 
 def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:
-    """Space of a vehicle's parameters, from their values in `params`, with their described bounds or
-    `vehicle_bounds`.
+    """Space of a vehicle's parameters, from their values in `params`, with `vehicle_bounds`, or their described
+    bounds, which are the chair's, in proportion to the vehicle.
 
     `names`: what to search; by default everything but `FIXED` and limits that are not there.
     """
@@ -198,12 +201,22 @@ def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = Non
         raise ValueError(f"no parameter {unknown[0]!r} (known: {', '.join(about)}).")
     initial = np.asarray(get_values(params, names), float)
     bounds = vehicle_bounds(names, initial, spec)
-    low = np.array([bounds.get(name, (about[name].low, 0))[0] for name in names], float)
-    high = np.array([bounds.get(name, (0, about[name].high))[1] for name in names], float)
+    found = [bounds.get(name) or _in_proportion(name, about[name], spec) for name in names]
+    low, high = (np.array([one[end] for one in found], float) for end in (0, 1))
     low, high = np.minimum(low, initial), np.maximum(high, initial)  # a preset may lie outside the usual range
     log = (low > 0) & (high > LOG_SPAN * np.maximum(low, 1e-30))
     kept = [(name, FIXED.get(name, "not selected")) for name in about if name not in names]
     return Space(tuple(names), low, high, initial, log, tuple(kept), Turned.of(spec))
+
+
+def _in_proportion(name: str, about: Parameter, spec: VehicleSpec) -> tuple[float, float]:
+    """Described bounds of a parameter, times as much as it grows with the vehicle, within what a file may hold."""
+    times = growth(about.unit, spec.mass, spec.wheel_radius)
+    if times == 1.0:
+        return about.low, about.high
+    file = parameter_field(name, about.unit, about.low, about.high, about.neutral)
+    low, high = file.low + ROUNDING * abs(file.low), file.high - ROUNDING * abs(file.high)
+    return max(times * about.low, low), min(times * about.high, high)
 
 
 def is_delay(name: str) -> bool:

@@ -172,9 +172,9 @@ class Stepped:
             raise ValueError(f"{robot.path}: MJX cannot step it: {error} Change or remove this in the file.") from None
         self.blank = self.mjx.make_data(self.nominal)
         self.float_type = jnp.result_type(float)
-        self.point, self.ahead, self.rest, self.activation, self.sign = (
+        self.point, self.ahead, self.rest, self.activation, self.sign, self.units = (
             jnp.asarray(one, self.float_type)
-            for one in (robot.point, robot.forward, robot.rest, robot.activation, robot.sign))
+            for one in (robot.point, robot.forward, robot.rest, robot.activation, robot.sign, robot.units))
         self.wheels = np.array(robot.wheels)
 
     def plant(self) -> Plant:
@@ -204,7 +204,7 @@ class Stepped:
         target = self.sign * self._wheel_speeds(command[0], command[1])
         if robot.motors:
             target = params.values["drive.kp"] * (target - state.qvel[self.wheels])
-        ctrl = jnp.zeros(robot.host.nu, self.float_type).at[np.array(robot.actuators)].set(target)
+        ctrl = jnp.zeros(robot.host.nu, self.float_type).at[np.array(robot.actuators)].set(self.units * target)
         if robot.integrals:
             ctrl = ctrl.at[np.array(robot.integrals)].set(self.sign * self._wheel_speeds(command[0], command[1]))
         data = self.blank.replace(qpos=state.qpos, qvel=state.qvel, act=state.act, qacc_warmstart=state.warm, ctrl=ctrl)

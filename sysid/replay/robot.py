@@ -47,6 +47,16 @@ class Robot:
         return tuple(int(self.host.dof_jntid[wheel]) for wheel in self.wheels)
 
     @property
+    def units(self) -> np.ndarray:
+        """(W,) Command of its actuator for 1 rad/s of a wheel; of a motor, the sign of the one that speeds it up.
+
+        A servo regulates the speed behind its gear: force = gain command + bias (gear speed), with a negative bias.
+        """
+        ids = list(self.actuators)
+        gear, gain = self.host.actuator_gear[ids, 0], self.host.actuator_gainprm[ids, 0]
+        return np.sign(gear * gain) if self.motors else -gear * self.host.actuator_biasprm[ids, 2] / gain
+
+    @property
     def activation(self) -> np.ndarray:
         """(na,) of actuators with a memory, at rest: no wheel lags behind."""
         found = np.zeros(self.host.na)

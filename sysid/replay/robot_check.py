@@ -131,6 +131,9 @@ def _missing(robot: Robot, check: Check) -> list[str]:
                      "casters and wheels, and the centre of mass")
     if robot.falls:
         found.append(f"{FALLS}. No fit takes it so")
+    elif check.speed < -STRAIGHT * check.command[0]:
+        found.append("it drives backwards: what turns its wheels pulls against the command. Check the signs of gear "
+                     "and gain of the actuators, and couplings of their joints")
     elif not check.drives_straight:
         found.append("it does not drive straight on within a tenth of the commanded speed: " + (
             "; ".join((*_limits(robot, check.command[0]), *_drags(robot))) or "check axes of the wheels and friction"))
@@ -172,7 +175,8 @@ def _limits(robot: Robot, v: float) -> list[str]:
         if host.jnt_actfrclimited[joint]:
             found.append(f"joint {host.joint(joint).name} gives at most {host.jnt_actfrcrange[joint, 1]:.3g} N m "
                          "(effort, or actuatorfrcrange)")
-    for one, joint in zip(robot.actuators, joints, strict=True) if not robot.motors and not robot.added else ():
+    of_file = zip(robot.actuators, joints, robot.units, strict=True) if not robot.motors and not robot.added else ()
+    for one, joint, unit in of_file:
         called = host.actuator(one).name or f"of joint {host.joint(joint).name}"
         gain, damping = -host.actuator_biasprm[one, 2] * host.actuator_gear[one, 0] ** 2, host.dof_damping[
             host.jnt_dofadr[joint]]
@@ -180,9 +184,9 @@ def _limits(robot: Robot, v: float) -> list[str]:
             found.append(f"actuator {called} (kv {gain:.3g} N m s/rad) is held back by a damping of "
                          f"{damping:.3g} of joint {host.joint(joint).name}: it reaches {gain / (gain + damping):.0%} "
                          "of its speed")
-        most = float(np.abs(host.actuator_ctrlrange[one]).max())
+        most = float(np.abs(host.actuator_ctrlrange[one] / unit).max())
         if host.actuator_ctrllimited[one] and most * robot.wheel_radius < v:
-            found.append(f"actuator {called} takes at most {most:.3g} rad/s (ctrlrange), which is "
+            found.append(f"actuator {called} takes at most {most:.3g} rad/s of its wheel (ctrlrange), which is "
                          f"{most * robot.wheel_radius:.3g} m/s")
     return found
 

@@ -16,7 +16,7 @@ FIRM_TIME, FIRM, ALONE = [0.01, 1.0], [0.99, 0.99, 0.001, 0.5, 2.0], 1e3
 """solref, solimp and solmix of wheels that a file says nothing of. With MuJoCo's own, one of 33 mm sinks by 0.4 mm, and
 rolls as if its radius were 0.6 % smaller."""
 WATER = 1000.0  # kg/m^3, of a link without a mass, as MuJoCo has it
-ROLLED = 1.02  # of a hub's radius, beyond which rollers on it touch the floor
+ROLLED = 1.02  # between two radii of a wheel, beyond which only the larger one touches the floor
 DEEP = 0.2  # of the wheel radius below the driven wheels: no caster stands there
 
 
@@ -52,21 +52,46 @@ def reach_of(host: mujoco.MjModel, body: int) -> float:
     """How far the shapes of a wheel, and of rollers on it, reach from its axle [m]; 0 without any."""
     data = mujoco.MjData(host)
     mujoco.mj_kinematics(host, data)
-    joint = int(host.body_jntadr[body])
-    axis = data.xaxis[joint]
-    reach = 0.0
+    return float(_outline(host, data, int(host.body_jntadr[body]), _shapes(host, body))[:, 1].max(initial=0.0))
+
+
+def tyre_places(host: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int]) -> np.ndarray:
+    """Where wheels (W, 3) touch the floor along their axles: the middle of what reaches as far as any, on the axle.
+
+    CAD programs put a joint at the chassis's side as often as in the wheel's middle.
+    """
+    places = np.array(data.xanchor[list(joints)])
+    for place, joint in zip(places, joints, strict=True):
+        shapes = _shapes(host, int(host.jnt_bodyid[joint]))
+        touching = [one for one in shapes if touches_ground(host, one)]
+        along, reach = _outline(host, data, joint, touching or shapes).T
+        if len(along):
+            outermost = along[ROLLED * reach >= reach.max()]
+            place += (outermost.min() + outermost.max()) / 2 * data.xaxis[joint]
+    return places
+
+
+def _shapes(host: mujoco.MjModel, body: int) -> list[int]:
+    """Geoms of a body and of all that hangs on it."""
+    found = []
     for geom in range(host.ngeom):
         over = int(host.geom_bodyid[geom])
         while over not in (0, body):
             over = int(host.body_parentid[over])
-        if over != body:
-            continue
-        points = data.geom_xpos[geom] + _corners(host, geom) @ data.geom_xmat[geom].reshape(3, 3).T
-        away = points - data.xanchor[joint]
-        away = away - np.outer(away @ axis, axis)
+        if over == body:
+            found.append(geom)
+    return found
+
+
+def _outline(host: mujoco.MjModel, data: mujoco.MjData, joint: int, geoms: Sequence[int]) -> np.ndarray:
+    """Points (K, 2) of geoms: where they are along a joint's axle, from its anchor, and how far they reach from it."""
+    found, axis = [np.zeros((0, 2))], data.xaxis[joint]
+    for geom in geoms:
+        away = data.geom_xpos[geom] + _corners(host, geom) @ data.geom_xmat[geom].reshape(3, 3).T - data.xanchor[joint]
+        along = away @ axis
         margin = float(host.geom_size[geom, 0]) if int(host.geom_type[geom]) in map(int, ROUND) else 0.0
-        reach = max(reach, float(np.linalg.norm(away, axis=1).max()) + margin)
-    return reach
+        found.append(np.column_stack([along, np.linalg.norm(away - np.outer(along, axis), axis=1) + margin]))
+    return np.concatenate(found)
 
 
 def _corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -90,8 +115,10 @@ def _corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
 
 def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequence[int]) -> list[str]:
     """Let wheels of a URDF that are meshes, boxes or rollers roll as spheres that reach as far, a note for each."""
-    notes = []
+    notes, data = [], mujoco.MjData(host)
+    mujoco.mj_kinematics(host, data)
     for body in bodies:
+        joint = int(host.body_jntadr[body])
         shapes = [int(host.geom_type[one]) for one in np.flatnonzero(host.geom_bodyid == body)]
         radius, one = reach_of(host, body), spec.body(host.body(body).name)
         solid = max((float(host.geom_size[geom, 0]) for geom in np.flatnonzero(host.geom_bodyid == body)
@@ -102,13 +129,14 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
         if not one.explicitinertial:
             one.explicitinertial, one.mass, one.ipos = True, host.body_mass[body], host.body_ipos[body]
             one.iquat, one.inertia = host.body_iquat[body], host.body_inertia[body]
+        along = float((tyre_places(host, data, [joint])[0] - data.xanchor[joint]) @ data.xaxis[joint])
         for geom in list(one.geoms):
             spec.delete(geom)
         for geom in one.find_all("geom"):
             geom.contype, geom.conaffinity = 0, 0
+        place = host.jnt_pos[joint] + along * host.jnt_axis[joint]
         one.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0.0, 0.0], contype=0, conaffinity=1, mass=0.0,
-                     pos=host.jnt_pos[host.body_jntadr[body]], solref=FIRM_TIME, solimp=FIRM, solmix=ALONE,
-                     name=one.name)
+                     pos=place, solref=FIRM_TIME, solimp=FIRM, solmix=ALONE, name=one.name)
         what = "has rollers, which are left out" if rollers else "is no cylinder or sphere" if shapes else (
             "has its shape on another link")
         notes.append(f"{path.name}: wheel {one.name} {what}: it rolls on the {radius:.4g} m by which it reaches from "

@@ -64,9 +64,9 @@ class RobotDrive:
         half = commands[..., 1] * robot.track / 2
         control = np.zeros((*commands.shape[:-1], host.nu))
         wanted = (commands[..., 0] - half, commands[..., 0] + half)
-        for side, one, sign in zip(robot.sides, robot.actuators, robot.sign, strict=True):
-            gear = host.actuator_gear[one, 0] if robot.motors else 1.0
-            control[..., one] = sign * wanted[side] / robot.wheel_radius * gear
+        units = np.ones(len(robot.wheels)) if robot.motors else robot.units
+        for side, one, sign, unit in zip(robot.sides, robot.actuators, robot.sign, units, strict=True):
+            control[..., one] = sign * wanted[side] / robot.wheel_radius * unit
         for side, one, sign in zip(robot.sides, robot.integrals, robot.sign, strict=False):
             control[..., one] = sign * wanted[side] / robot.wheel_radius
         return control
@@ -115,12 +115,12 @@ def rolling_ratio(robot: Robot) -> float:
 
 
 def _close_loop(model: mujoco.MjModel, nominal: mujoco.MjModel, robot: Robot, kp: float) -> None:
-    """Put the speed controller before motors into their law: torque = gain kp (target - speed)."""
+    """Put the speed controller before motors into their law: torque = |gear gain| kp (target - speed)."""
     for one in robot.actuators:
         gain, gear = model.actuator_gainprm[one, 0], model.actuator_gear[one, 0]
-        slope = abs(gain) * kp / abs(gear)  # a gear may turn the motor the other way round
+        slope = abs(gain) * kp / abs(gear)
         model.actuator_biastype[one] = int(mujoco.mjtBias.mjBIAS_AFFINE)
-        model.actuator_gainprm[one, 0] = slope
+        model.actuator_gainprm[one, 0] = slope * gear  # it may turn the motor the other way round
         model.actuator_biasprm[one, :3] = 0.0, 0.0, -slope
         if nominal.actuator_ctrllimited[one]:
             limits = np.sort(nominal.actuator_ctrlrange[one] * gain)

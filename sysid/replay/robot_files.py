@@ -21,6 +21,7 @@ from sysid.replay import xacro_text
 from sysid.replay.stated_drive import StatedDrive, stated_drive
 from sysid.replay.urdf_links import compiler_of, complete_links
 from sysid.replay.xacro_text import around, package_folders
+from whill_mjx.io.fields import shown
 from whill_mjx.io.reading import LONGEST_REASON, MB, decoded, read_bytes
 from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
@@ -28,6 +29,12 @@ MODEL_BYTES = 20 * MB
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
 LONGEST = 60  # s that a xacro file may take, processor time or not
 BOX = 0.1  # m, of a mesh whose body says nothing of its size
+NUMBERS = frozenset((
+    "xyz", "rpy", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "radius", "length", "scale",
+    "pos", "quat", "axisangle", "xyaxes", "zaxis", "euler", "fromto", "axis", "diaginertia", "fullinertia", "density",
+    "size", "mass", "damping", "friction", "armature", "stiffness", "frictionloss", "gear", "kp", "kv", "gainprm",
+    "biasprm", "gravity", "timestep"))  # fmt: skip
+"""Attributes of a URDF's links and joints, and of MJCF, that are finite numbers; and the `value` of a URDF's mass."""
 OTHER = "Robots are read from URDF (<robot>), xacro and MJCF (<mujoco>); export it as one of them."
 XACRO = "pip install xacro"
 
@@ -68,6 +75,9 @@ def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | Non
         return RobotFile(mujoco.MjSpec.from_file(str(path)), [])  # MuJoCo says where the mistake is
     if top.tag not in ("robot", "mujoco"):
         raise ValueError(f"{path}: it begins with <{top.tag[:40]}>. {OTHER}")
+    for part in top if top.tag == "robot" else [top]:
+        if part.tag in ("link", "joint", "mujoco"):
+            _check_numbers(path, part)
     if top.tag != "robot":
         spec = mujoco.MjSpec.from_string(text) if xacro else mujoco.MjSpec.from_file(str(path))
         included += _included(path.parent, path, top)
@@ -76,6 +86,29 @@ def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | Non
     notes = [*left_out, *complete_links(path, top), *_place_urdf_meshes(path, top, wheels, wheel_radius)]
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode"))
     return RobotFile(spec, notes, _frictions(top), drive, tuple(included))
+
+
+def _check_numbers(path: Path, top: ElementTree.Element) -> None:
+    """Raise ValueError where numbers of an element or of those in it are none or not finite; MuJoCo takes some for
+    0."""
+    waiting = [(top, top)]  # each with what has a name, of which it is a part
+    while waiting:
+        element, holder = waiting.pop()
+        holder = element if element.get("name") else holder
+        for name, text in element.items():
+            is_number = name in NUMBERS or (element.tag, name) == ("mass", "value")
+            if is_number and not all(map(_is_finite, text.split())):
+                what = name if element is holder else f"{name} of {element.tag}"
+                raise ValueError(f"{path}: {what} of {holder.tag} {holder.get('name', '')!r} is {shown(text)}; it must "
+                                 "be made of finite numbers. Correct it.")
+        waiting += [(one, holder) for one in element]
+
+
+def _is_finite(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _included(folder: Path, path: Path, top: ElementTree.Element) -> list[Path]:
@@ -91,9 +124,11 @@ def _included(folder: Path, path: Path, top: ElementTree.Element) -> list[Path]:
                 continue
             found.append(one)
             try:
-                waiting.append((one, ElementTree.parse(one).getroot()))
+                root = ElementTree.parse(one).getroot()
             except ElementTree.ParseError:
                 continue  # MuJoCo is less strict
+            _check_numbers(one, root)
+            waiting.append((one, root))
     return found
 
 

@@ -11,7 +11,14 @@ import mujoco
 import numpy as np
 
 from sysid.replay.robot import Robot
-from sysid.replay.robot_contacts import as_in_gazebo, as_round_wheels, below_wheels, leave_out_contacts, radius_of
+from sysid.replay.robot_contacts import (
+    as_in_gazebo,
+    as_round_wheels,
+    below_wheels,
+    leave_out_contacts,
+    radius_of,
+    tyre_places,
+)  # fmt: skip
 from sysid.replay.robot_files import read_robot
 from sysid.replay.robot_rest import NEAR, falls, near_floor, raise_supports, settle, sliding
 from sysid.replay.robot_servos import (
@@ -24,12 +31,14 @@ from sysid.replay.robot_servos import (
     regulate,
     wheel_inertias,
 )  # fmt: skip
-from sysid.replay.wheels import as_plain_wheels, wheel_joints
+from sysid.replay.wheels import as_plain_wheels, swapped, wheel_joints
 from whill_mjx.io.fields import Field, check
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
 WHEEL_RADIUS = Field("wheel radius", "m", 1e-3, 2.0,
                      remedy='Sizes are in metres; a mesh in millimetres needs scale="0.001 0.001 0.001".')
+DISTANCE = Field("distance between the wheels", "m", 1e-3, 10.0,
+                 remedy="Correct the places of these joints, or name other wheels with --wheels.")
 LIGHTEST = 0.5  # m/s^2 of gravity
 STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
 SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
@@ -57,11 +66,13 @@ def load_robot(
     host, data, ids = draft.host, draft.data, draft.ids
     body = int(host.body_rootid[draft.bodies[0]])
     half = len(ids) // 2
-    left = data.xanchor[ids[:half]].mean(0) - data.xanchor[ids[half:]].mean(0)
+    tyres = tyre_places(host, data, ids)
+    left = tyres[:half].mean(0) - tyres[half:].mean(0)
     distance = float(np.linalg.norm(left))
+    check(str(path), DISTANCE, round(distance, 6), f"the distance between {' and '.join(draft.joints)}")
     left = left / distance
     rotation = data.xmat[body].reshape(3, 3).copy()  # the data moves on
-    middle = data.xanchor[ids].mean(0) - data.xpos[body]
+    middle = tyres.mean(0) - data.xpos[body]
     sign = tuple(float(np.sign(data.xaxis[one] @ left)) for one in ids)
     actuators = tuple(int(np.flatnonzero(host.actuator_trnid[:, 0] == one)[0]) for one in ids)
     free = int(host.body_jntadr[body])
@@ -124,7 +135,8 @@ def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timeste
     except ValueError as error:
         missing = "; ".join(note for note in notes if note.endswith("left out"))
         raise ValueError(f"{error}{f' ({missing}.)' if missing else ''}") from None
-    notes += [*as_plain_wheels(path, spec, joints, file.drive), *_with_weight(path, spec)]
+    notes += [*swapped(path, spec, wheels, joints), *as_plain_wheels(path, spec, joints, file.drive),
+              *_with_weight(path, spec)]
     if stated is not None:
         if len(joints) == 2:  # the file has none
             spec.option.impratio, spec.option.cone = STIFF, mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -175,7 +187,7 @@ def _ground(draft: _Draft, radius: float) -> None:
     """Put the robot on a floor, without contacts that would lift its wheels and those that MJX lacks."""
     path, spec, bodies = draft.path, draft.spec, draft.bodies
     if not (draft.host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)).any():
-        bottom = float(draft.data.xpos[bodies[0], 2]) - radius_of(path, draft.host, bodies[0], radius)
+        bottom = float(draft.data.xanchor[draft.ids[0], 2]) - radius_of(path, draft.host, bodies[0], radius)
         taken = {geom.name for geom in spec.geoms}
         name = next(one for one in ("floor", *(f"floor_{k}" for k in range(len(taken) + 1))) if one not in taken)
         spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, bottom],

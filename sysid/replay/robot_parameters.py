@@ -85,7 +85,9 @@ class Entry:
         if self.array in LIMITS:
             found[self.array] = put(found[self.array], 0, -value)
         for column in self.servo:
-            found["actuator_biasprm"] = put(found.get("actuator_biasprm", model.actuator_biasprm), column, -value)
+            ratio = model.actuator_biasprm[rows, column] / model.actuator_gainprm[rows, 0]  # -1, but for <general>
+            bias = found.get("actuator_biasprm", model.actuator_biasprm)
+            found["actuator_biasprm"] = put(bias, column, value * ratio)
         return found
 
 
@@ -127,7 +129,8 @@ def resolve(robot: Robot, path: str) -> Entry:
     rows = [int(host.jnt_dofadr[one]) for one in ids] if array.startswith("dof_") else ids
     servo: tuple[int, ...] = ()
     if array == "actuator_gainprm" and column == 0:
-        servo = tuple(one for one in (1, 2) if (host.actuator_biasprm[ids, one] != 0).all())
+        pulls = (host.actuator_gainprm[ids, 0] != 0).all()
+        servo = tuple(one for one in (1, 2) if pulls and (host.actuator_biasprm[ids, one] != 0).all())
     entry = Entry(path, array, tuple(rows), column, unit, tuple(ids), servo)
     if array == "dof_frictionloss" and (host.dof_frictionloss[rows] <= 0).any():
         raise ValueError(f"{robot.path}: {path} is 0 in the file, and MJX then leaves dry friction out. Give the joint "

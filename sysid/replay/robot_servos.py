@@ -120,8 +120,8 @@ def regulate(
 
 def is_stable(host: mujoco.MjModel, joints: Sequence[str], inertias: Sequence[tuple[float, float]]) -> bool:
     """Whether wheels that slip are stable under the torques of their actuators at the start of a step."""
-    gains = [float(-host.actuator_biasprm[host.actuator_trnid[:, 0] == host.joint(name).id, 2].min(initial=0.0))
-             for name in joints]
+    stiff = -host.actuator_biasprm[:, 2] * host.actuator_gear[:, 0] ** 2  # at the joint
+    gains = [float(stiff[host.actuator_trnid[:, 0] == host.joint(name).id].max(initial=0.0)) for name in joints]
     return all(gain * host.opt.timestep <= wheel for gain, (wheel, _) in zip(gains, inertias, strict=True))
 
 
@@ -162,7 +162,8 @@ def are_motors(path: Path, host: mujoco.MjModel, actuators: Sequence[int]) -> bo
     bias = host.actuator_biasprm[ids]
     if (host.actuator_biastype[ids] == int(mujoco.mjtBias.mjBIAS_NONE)).all():
         return True
-    if (bias[:, 1] == 0).all() and (bias[:, 2] < 0).all() and (host.actuator_dyntype[ids] == 0).all():
+    pulls = (host.actuator_gainprm[ids, 0] != 0).all()
+    if pulls and (bias[:, 1] == 0).all() and (bias[:, 2] < 0).all() and (host.actuator_dyntype[ids] == 0).all():
         return False
     raise ValueError(f"{path}: the wheels' actuators are neither motors nor velocity servos. Use <motor> or "
                      "<velocity>.")

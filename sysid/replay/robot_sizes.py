@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from sysid.replay.robot import Robot
-from sysid.replay.robot_contacts import ROUND, parts, touches_ground
+from sysid.replay.robot_contacts import ROUND, parts, touches_ground, tyre_places
 
 SIZES = ("wheels.radius", "wheels.difference", "wheels.track")
 
@@ -59,14 +59,15 @@ def sizes_of(robot: Robot, rolling: float = 1.0) -> dict[str, Size]:
     """The true sizes that may be fitted, of round wheels; `rolling`: radius rolled on over that of geoms."""
     host, data = robot.host, mujoco.MjData(robot.host)
     mujoco.mj_kinematics(host, data)
-    joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+    joints = robot.joints
     bodies = [int(host.jnt_bodyid[joint]) for joint in joints]
     touching = [[int(one) for one in parts(host, body) if touches_ground(host, int(one))] for body in bodies]
     kinds = [int(one) for one in ROUND]
     if not all(geoms and all(int(host.geom_type[one]) in kinds for one in geoms) for geoms in touching):
         return {}
     geoms, half = tuple(tuple(one) for one in touching), len(joints) // 2
-    out = data.xanchor[joints[:half]].mean(0) - data.xanchor[joints[half:]].mean(0)
+    tyres = tyre_places(host, data, joints)
+    out = tyres[:half].mean(0) - tyres[half:].mean(0)
     out, up = out / np.linalg.norm(out), np.array([0.0, 0.0, 1.0])
     frames = [data.xmat[host.body_parentid[body]].reshape(3, 3).T for body in bodies]
     raised = tuple(frame @ up for frame in frames)

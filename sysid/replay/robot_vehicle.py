@@ -21,6 +21,7 @@ import numpy as np
 
 from sysid.replay.models import Parameters, Twin, describe_parameters, with_effects
 from sysid.replay.robot import Robot
+from sysid.replay.robot_contacts import tyre_places
 from sysid.replay.robot_parameters import Entry, Overlaid
 from sysid.replay.robot_servos import ROTOR_SHARE
 from sysid.replay.robot_sizes import Size
@@ -65,7 +66,8 @@ def vehicle_of(
                    wheel_inertia=robot.spin, body_length=length, body_width=width, body_height=height)
     (tyre, wheels), (ball, balls) = (
         _friction(robot, entries, values, geoms) for geoms in (_tyres(robot), robot.sliding))
-    gain = float(abs(robot.host.actuator_gainprm[robot.actuators[0], 0])) if robot.motors else 1.0
+    host, motor = robot.host, robot.actuators[0]
+    gain = float(abs(host.actuator_gear[motor, 0] * host.actuator_gainprm[motor, 0])) if robot.motors else 1.0
     found = {
         "body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
         "body.com_y": com[1], "body.com_z": com[2],
@@ -140,7 +142,7 @@ def _root(robot: Robot) -> int:
 def _ahead(robot: Robot, places: np.ndarray) -> np.ndarray:
     """How far places (K, 3) in the room are ahead of the middle of the driven wheels, at rest [m]."""
     data = _rested(robot)
-    return (places - data.xanchor[list(robot.joints)].mean(0)) @ _axes(robot, data)[0]
+    return (places - tyre_places(robot.host, data, robot.joints).mean(0)) @ _axes(robot, data)[0]
 
 
 def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.ndarray, float]:
@@ -149,7 +151,7 @@ def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.nda
     host, data = robot.host, _rested(robot)
     model: Any = Overlaid(host, arrays)
     bodies = np.flatnonzero(host.body_rootid == _root(robot))
-    middle = data.xanchor[list(robot.joints)].mean(0)
+    middle = tyre_places(host, data, robot.joints).mean(0)
     masses, places = model.body_mass[bodies], (data.xipos[bodies] - middle) @ _axes(robot, data).T
     mass = float(masses.sum())
     centre = masses @ places / mass
@@ -165,7 +167,7 @@ def extent_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == _root(robot))
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     middle = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, host.geom_aabb[geoms, :3])
-    middle = (middle - data.xanchor[list(robot.joints)].mean(0)) @ axes.T
+    middle = (middle - tyre_places(host, data, robot.joints).mean(0)) @ axes.T
     reach = np.einsum("gij,gj->gi", np.abs(axes @ turns), host.geom_aabb[geoms, 3:])
     return (middle - reach).min(0), (middle + reach).max(0)
 

@@ -137,7 +137,4 @@ def _reach(link: ElementTree.Element) -> float:
 
 
 def _number(element: ElementTree.Element, name: str) -> float:
-    try:
-        return float(element.get(name, 0.0))
-    except ValueError:
-        return 0.0
+    return float(element.get(name, "").strip() or 0.0)

@@ -29,7 +29,8 @@ MANY_TURNS = 200 * np.pi  # rad of a range that is no end
 def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDrive) -> tuple[str, ...]:
     """Names of the joints of the driven wheels: those on the left from front to rear, then those on the right.
 
-    `wheels`: joints or actuators that were named, of two the left one first; `stated`: what the file says of its drive.
+    `wheels`: joints or actuators that were named; `stated`: what the file says of its drive. Two that neither names nor
+    places show a side of are left and right as they were named.
     ValueError where neither the file nor names show them, or they do not stand in pairs.
     """
     hinges = {joint.name: joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.name}
@@ -40,7 +41,7 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDri
             raise ValueError(f"{path}: wheels are {' and '.join(wheels)}; they must be two hinge joints or "
                              f"their actuators, left and right, or four, six or more of a skid-steered robot "
                              f"(joints: {', '.join(hinges)}; actuators: {', '.join(driven)}).")
-        return (found[0], found[1]) if len(found) == 2 else _paired(path, spec, found)
+        return _paired(path, spec, wheels, found)
     standing = _standing(spec, hinges)
     if standing is not None:
         sides_of_plugin = _plugin_wheels(path, standing, stated)
@@ -208,9 +209,23 @@ def _rolls(joint: Any) -> bool:
     return not _has_end(joint) and WHEEL.search(f"{joint.name} {joint.parent.name}") is not None
 
 
-def _paired(path: Path, spec: Any, names: Sequence[str]) -> tuple[str, ...]:
+def swapped(path: Path, spec: Any, wheels: Sequence[str], joints: Sequence[str]) -> list[str]:
+    """A note where of two wheels the right one was named first."""
+    targets = {actuator.name: actuator.target for actuator in spec.actuators}
+    if len(wheels) != 2 or targets.get(wheels[0], wheels[0]) == joints[0]:
+        return []
+    return [f"{path.name}: --wheels names {wheels[0]} first, but {joints[0]} is on the left, with x ahead: it is taken "
+            "for the left one"]
+
+
+def _paired(path: Path, spec: Any, wheels: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Joints of named wheels by their sides."""
+    if len(names) == 2 and _sides(wheels) in ([1, -1], [-1, 1]):
+        return (names[0], names[1]) if _sides(wheels) == [1, -1] else (names[1], names[0])
     standing = _standing(spec, {name: spec.joint(name) for name in names})
     found = None if standing is None else _by_side(standing, names)
+    if found is None and len(names) == 2:
+        return names[0], names[1]
     if found is None:
         raise ValueError(f"{path}: wheels {', '.join(names)} do not stand in pairs, one left and one right. Name the "
                          "driven wheels of both sides.")

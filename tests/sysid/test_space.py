@@ -11,11 +11,14 @@ import pytest
 from benchmarks.planted_logs import Schedule, fitted_plant, write_dataset
 from sysid.errors.space import RATIO, Space, make_space, searched
 from sysid.logs.log import load_log
+from sysid.missing.catalogue import hypotheses
 from sysid.replay.differences import make_replay
 from sysid.replay.models import measured_effects, with_effects
-from whill_mjx.vehicle.parameters import set_values
-from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.effects import EFFECTS
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
+from whill_mjx.vehicle.presets import in_short, preset_params
 from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR, find_spec, in_proportion
+from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
 
 @pytest.mark.quick
@@ -127,3 +130,58 @@ def test_a_fit_gives_a_differential_drive_with_slip_losses_that_rise_with_speed(
     assert set(added) - set(measured_effects(physical, WHILL_CR, (), losses=False)) == {"wheel_damping"}
     assert measured_effects(preset_params(WARTHOG, "physical"), WARTHOG, ()) == ("suspension",)
     assert measured_effects(preset_params(WHILL_CR, "paper"), WHILL_CR, ()) == ()
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("like", ["whill_cr", "husky", "warthog", "create"])
+@pytest.mark.parametrize("kind", ["paper", "physical"])
+@pytest.mark.parametrize(("mass", "radius", "track", "wheelbase"), [
+    (0.1, 0.01, 0.05, 0.04), (0.15, 0.02, 0.08, 0.06), (3.0, 0.03, 0.2, 0.2), (52.0, 0.1325, 0.496, 0.6),
+    (900.0, 0.3, 1.2, 1.5), (3000.0, 0.6, 2.0, 2.5), (5000.0, 1.0, 3.0, 6.0)])  # fmt: skip
+def test_what_a_fit_may_find_of_a_vehicle_can_be_read_again(tmp_path, like, kind, mass, radius, track, wheelbase):
+    spec = in_proportion(find_spec(like), "vehicle", radius, track, wheelbase, mass)
+    params = in_short(spec, kind)
+    have = {effect.name for effect in params.effects}
+    params = with_effects(params, [name for name in EFFECTS if name not in have])
+    names = list(describe(params))
+    names = [name for name, value in zip(names, get_values(params, names), strict=True) if np.isfinite(value)]
+    space = make_space(params, spec, names)
+    for name, values in (("start", space.initial), ("low", space.low), ("high", space.high)):
+        written = set_values(params, space.names, jnp.asarray(values))
+        read = load_vehicle(save_vehicle(tmp_path / f"{name}.toml", spec, written))[1]
+        np.testing.assert_array_equal(get_values(read, space.names), get_values(written, space.names))
+
+
+@pytest.mark.quick
+def test_forces_and_sizes_that_are_looked_for_follow_the_vehicle():
+    """A vehicle of an eighth of the chair's lengths: 1/512 of its mass."""
+    small = in_proportion(WHILL_CR, "small", 0.1325 / 8, 0.496 / 8, 0.6 / 8, 52.0 / 512)
+    names = ["torque_saturation.limit", "side_force.sideways", "supply_sag.per_watt", "rolling_resistance.mu_r"]
+    found, hypothesis = {}, {}
+    for spec in (WHILL_CR, small):
+        params = preset_params(spec, "physical")
+        hypothesis[spec.name] = {one.key: one for one in hypotheses(spec, params)}
+        params = with_effects(params, ["torque_saturation", "side_force", "supply_sag"])
+        params = set_values(params, ["torque_saturation.limit"], jnp.asarray([spec.mass]))
+        space = make_space(params, spec, names)
+        found[spec.name] = np.stack([space.low, space.high])
+    np.testing.assert_array_equal(found["whill_cr"], [[5.0, -300.0, 0.0, 0.0], [3000.0, 300.0, 0.02, 0.08]])
+    np.testing.assert_allclose(found["small"], found["whill_cr"] * [1 / 512, 1 / 512, 512, 1], rtol=1e-9)
+    chair, other = hypothesis.values()
+    assert chair["supply_sag/power"].axes[0].unit == 0.0006
+    assert dict(chair["payload_shift"].constants) == {"payload_shift.z": 0.3}
+    assert other["supply_sag/power"].axes[0].unit == pytest.approx(0.0006 * 512)
+    assert dict(other["payload_shift"].constants)["payload_shift.z"] == pytest.approx(0.3 / 8)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("name", "value"), [
+    ("torque_drive.kp", -1e9), ("torque_drive.kp", 1e9), ("torque_drive.kp", float("inf")),
+    ("torque_drive.kp", -1.0), ("torque_drive.ki", -1e-3), ("torque_drive.ki", float("nan")),
+    ("torque_drive.limit", -1.0), ("torque_drive.limit", 1e12), ("yaw_scrub.torque", 1e9),
+    ("body.yaw_inertia", 0.0), ("body.yaw_inertia", 1e9), ("body.com_x", -265.0)])  # fmt: skip
+def test_a_value_that_no_vehicle_has_is_refused(tmp_path, name, value):
+    spec = find_spec("whill_cr")
+    written = set_values(preset_params(spec, "physical"), [name], jnp.asarray([value]))
+    with pytest.raises(ValueError, match=f"{name} is .*it must"):
+        load_vehicle(save_vehicle(tmp_path / "vehicle.toml", spec, written))

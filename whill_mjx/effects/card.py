@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from whill_mjx.vehicle.specs import GRAVITY, VehicleSpec
+from whill_mjx.vehicle.specs import GRAVITY, WHILL_CR, VehicleSpec
 
 QUANTITIES = (
     "speed", "yaw rate", "direction of travel", "direction of turning", "command to turn", "heading along x",
@@ -123,6 +123,16 @@ class Scale:
     def speed(self) -> float:
         """A usual speed [m/s]."""
         return min(self.spec.v_max, 1.0)
+
+    @property
+    def power(self) -> float:
+        """Power at that speed against a force that is the same share of the weight, over the chair's [-]."""
+        return self.weight / (WHILL_CR.mass * GRAVITY) * self.speed
+
+    @property
+    def height(self) -> float:
+        """Height of the body over the chair's [-]."""
+        return self.spec.body_height / WHILL_CR.body_height
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class PayloadShift(Effect):
                 Axis("mass", 0.08 * scale.spec.mass),
                 Axis("x", 0.01 * scale.spec.mass * scale.spec.wheelbase, form="moment", signed=True, dependent=True),
                 Axis("y", 0.01 * scale.spec.mass * scale.spec.track, form="moment", signed=True, dependent=True),
-            ), constants=(("z", 0.3),)),
+            ), constants=(("z", 0.3 * scale.height),)),
         ),
         forbids=(SHOWS_AT_BOTH_ENDS, SAME_BACKWARD, SAME_ALL_DRIVE),
         sensor="scales under the wheels",

@@ -28,10 +28,10 @@ class SupplySag(Effect):
     source = "estimate: 5 to 15 % late in a session or under full load"
     card = Card(
         order=80,
-        variants=(
+        variants=lambda scale: (
             Variant((Axis("per_second", 0.004),), "time"),
             Variant((Axis("drain", 0.0002),), "session", constants=(("session", 1.5 * ROUND),)),
-            Variant((Axis("per_watt", 0.0006),), "power"),
+            Variant((Axis("per_watt", 0.0006 / scale.power),), "power"),
             Variant((Axis("torque_drive.kp", -0.1, form="factor", signed=True),), "gain", kind="parameter_shift"),
         ),
         forbids=(SAME_BACKWARD, SAME_LEFT_AND_RIGHT),

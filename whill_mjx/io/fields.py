@@ -306,9 +306,20 @@ VALUE = (
 
 INTERVAL = Field("interval", kind="numbers", count=2, exceptions=(-math.inf, math.inf))
 
+SIZE = {field.name: field for field in SIZES}
+CHAIR = (52.0, 0.1325)
+"""Mass [kg] and wheel radius [m] of the vehicle for which the ranges of parameters are stated."""
+GROWTH = {
+    "kg": (1, 0), "N": (1, 0), "N s/m": (1, 0), "N s^2/m^2": (1, 0), "N m": (1, 1), "N m s/rad": (1, 2),
+    "N m/rad": (1, 2), "kg m^2": (1, 2), "1/W": (-1, 0), "s/kg": (-1, 0),
+}  # fmt: skip
+"""Powers of mass and of length with which parameters of a unit grow with the vehicle. Gains of a drive act on a mass at
+the radius of its wheels."""
+
 RANGES: dict[str, tuple[float, float]] = {
-    "body.mass": (0.01, 1e4),
-    "body.yaw_inertia": (1e-6, 1e5),
+    "body.mass": (SIZE["mass"].low, SIZE["mass"].high),
+    "body.yaw_inertia": (1e-9, 1e7),
+    **dict.fromkeys(("body.com_x", "body.com_y", "body.com_z"), (-20.0, 20.0)),
     **dict.fromkeys(
         ("actuator_lag.cascade", "axle_pivot.freedom", "command_expiry.loss", "rolling_contact.grip",
          "unnamed.with_motion", "wheel_inertia.reaction"), (0.0, 1.0)),
@@ -316,8 +327,6 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("incline.along_x", "incline.along_y", "slope.along_x", "slope.along_y"), (-1.5, 1.5)),
     "drive_gain_difference.difference": (-2.0, 2.0),
     "gyro_bias.scale": (-10.0, 10.0),
-    "torque_drive.kp": (1e-4, 2e3),
-    "torque_drive.limit": (1e-3, 2e4),
     "track_width.error": (-0.9, 5.0),
     "unnamed.quantity": (1.0, 11.0),
     **dict.fromkeys(("wheel_radius_difference.difference", "wheel_radius_difference.common"), (-0.6, 0.6)),
@@ -325,15 +334,26 @@ RANGES: dict[str, tuple[float, float]] = {
 """Widest sensible range of a parameter of a vehicle file, where it is not the usual one of `parameter_field`."""
 
 
+def growth(unit: str, mass: float, wheel_radius: float) -> float:
+    """How many times larger than the chair's a parameter of a unit is on a vehicle that is built alike; 1 for the
+    chair."""
+    powers = GROWTH.get(unit, (0, 0))
+    return float((mass / CHAIR[0]) ** powers[0] * (wheel_radius / CHAIR[1]) ** powers[1])
+
+
 def parameter_field(name: str, unit: str, low: float, high: float, neutral: float) -> Field:
     """The field of a parameter of a vehicle: ten times beyond the range that a fit may search, and the neutral value.
+
+    What grows with the vehicle may be as small as on the smallest one and as large as on the largest one (`SIZES`).
 
     Args:
         name: dotted, such as "pid_drive.kp".
         unit, low, high, neutral: of its `Parameter`.
     """
-    reach = 10.0 * max(abs(low), abs(high))
-    lowest, highest = (-reach if low < 0 else low / 10.0), (reach if high > 0 else 0.0)
+    mass, radius = SIZE["mass"], SIZE["wheel_radius"]
+    smaller, larger = sorted((growth(unit, mass.low, radius.low), growth(unit, mass.high, radius.high)))
+    reach = 10.0 * larger * max(abs(low), abs(high))
+    lowest, highest = (-reach if low < 0 else low * smaller / 10.0), (reach if high > 0 else 0.0)
     lowest, highest = RANGES.get(name, (lowest, highest))
     neutral_too = not (name.startswith("body.") or lowest <= neutral <= highest)
     return Field(name, unit, lowest, highest, exceptions=(neutral,) if neutral_too else ())
