@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from whill_mjx import maps
 from whill_mjx.env import make_env, observe, reset_state, step_state
 from whill_mjx.learning.identity import identity_of
 from whill_mjx.learning.setup import find_preset
@@ -26,6 +27,7 @@ from whill_mjx.world.maps import (
     Reach,
     cast,
     load_footprints,
+    load_map,
     make_map_scene,
     map_scene_sampler,
     picture,
@@ -319,3 +321,56 @@ def test_maps_side_by_side_keep_their_walls_places_and_ways():
     places = ways.points.reshape(-1, 2)[listed]
     assert len(listed) and np.all(np.hypot(*(places - ways.start[-1]).T) <= 10.0 + 1e-3)
     assert side_by_side(made[:1]).walls is made[0].walls
+
+
+def written_map(folder, origin, cells=None):
+    """Path of a nav2 map of rooms at an origin."""
+    cells = many_rooms().cells if cells is None else cells
+    (folder / "map.pgm").write_bytes(b"P5 %d %d 255\n" % cells.shape[::-1]
+                                     + np.where(cells[::-1] == FREE, 254, 0).astype(np.uint8).tobytes())
+    path = folder / f"map_{origin[0]}.yaml"
+    path.write_text(f"image: map.pgm\nresolution: 0.05\norigin: {list(origin)}\nnegate: 0\noccupied_thresh: 0.65\n"
+                    "free_thresh: 0.196\n")
+    return path
+
+
+def test_a_map_far_from_zero_is_the_same_one_moved_there_by_whole_metres(tmp_path):
+    near, far = (read_map(written_map(tmp_path, origin)) for origin in ((-10.3, -4.0, 0.4), (499989.7, 900000.0, 0.4)))
+    assert near.shift == (0.0, 0.0) and near.origin == (-10.3, -4.0, 0.4)
+    moved = np.add(far.shift, [-500000.0, -900004.0])
+    assert np.abs(moved).max() < 20 and np.array_equal(moved, np.rint(moved)) and far.farthest() < 20
+    one, other = make_map_scene(near), make_map_scene(far)
+    np.testing.assert_allclose(other.walls.segments + moved, one.walls.segments, atol=1e-5)
+    np.testing.assert_allclose(other.places.start[:, :2] + moved, one.places.start[:, :2], atol=1e-6)
+    np.testing.assert_array_equal(load_map(tmp_path / "map_499989.7.yaml").origin, far.origin)
+
+
+def test_the_command_says_and_writes_by_how_much_it_moved_a_far_map(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(0, [12.0, 9.0], (60_000, 2)), np.zeros(60_000)])
+    np.save(tmp_path / "site.npy", floor + [691_600.0, 5_334_700.0, 519.0])  # UTM
+    maps.main(maps.Import(tmp_path / "site.npy", tmp_path / "scene", pixels=200))
+    with np.load(tmp_path / "scene.npz") as arrays:
+        places = arrays["start"][:, :2] + arrays["shift"]
+        assert np.abs(arrays["walls"]).max() < 10.0
+    assert (places > [691_600.0, 5_334_700.0]).all() and (places < [691_612.0, 5_334_709.0]).all()
+    assert "add 691606, 5334704 m to x, y" in capsys.readouterr().out.replace("5334705", "5334704")
+
+
+def test_a_map_that_reaches_too_far_is_refused_with_the_remedy():
+    far = dataclasses.replace(many_rooms(), origin=(0.0, 9000.0, 0.0))
+    with pytest.raises(ValueError, match=r"corners lie 9008 m from zero.* 4096 m.*brought_near\(\)"):
+        make_map_scene(far)
+    assert len(make_map_scene(far.brought_near()).walls.segments) > 40
+    with pytest.raises(ValueError, match=r"corners lie 10000 m from zero.*Cut it into smaller ones\.$"):
+        make_map_scene(dataclasses.replace(many_rooms(), resolution=50.0, origin=(-1e4, 0.0, 0.0)))
+
+
+def test_maps_of_other_places_come_side_by_side_and_not_kilometres_apart():
+    plan = read_map("made:0")
+    made = [make_map_scene(dataclasses.replace(plan, origin=(0.0, y, 0.0)), Reach(farthest=6.0)) for y in (0.0, 900.0)]
+    group = side_by_side(made)
+    assert np.ptp(group.walls.segments.reshape(-1, 2), 0)[1] == pytest.approx(np.ptp(made[0].walls.segments[..., 1]))
+    np.testing.assert_allclose(group.places.start[-1, :2] - group.shifts[1], made[1].places.start[-1, :2], atol=1e-6)
+    with pytest.raises(ValueError, match=r"80 maps side by side reach 4\d\d\d m from zero.*Name fewer maps"):
+        side_by_side([made[0]] * 80)
