@@ -16,9 +16,12 @@ from whill_mjx import maps
 from whill_mjx.env import make_env, observe, reset_state, step_state
 from whill_mjx.learning.identity import identity_of
 from whill_mjx.learning.setup import find_preset
+from whill_mjx.tasks.base import Task
+from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.map_goal import MapGoal
 from whill_mjx.vehicle.kinematics import reference_pose
-from whill_mjx.world.collision import obstacles_of, touches
+from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR
+from whill_mjx.world.collision import free_distance, obstacles_of, touches
 from whill_mjx.world.maps import (
     FREE,
     OCCUPIED,
@@ -31,15 +34,17 @@ from whill_mjx.world.maps import (
     make_map_scene,
     map_scene_sampler,
     picture,
+    reach_of,
     read_map,
     shown,
 )
 from whill_mjx.world.maps import walls as map_wall_module
+from whill_mjx.world.maps.places import farthest_move
 from whill_mjx.world.maps.several import GAP, side_by_side
 from whill_mjx.world.maps.straight import open_space, outline, straight_walls
 from whill_mjx.world.maps.walls import map_walls, most_seen, wall_boxes
 from whill_mjx.world.render import camera_rotation, pinhole, render_frame
-from whill_mjx.world.scene import footprint
+from whill_mjx.world.scene import footprint, no_boxes, stack_boxes
 
 pytestmark = pytest.mark.quick
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "maps"
@@ -374,3 +379,69 @@ def test_maps_of_other_places_come_side_by_side_and_not_kilometres_apart():
     np.testing.assert_allclose(group.places.start[-1, :2] - group.shifts[1], made[1].places.start[-1, :2], atol=1e-6)
     with pytest.raises(ValueError, match=r"80 maps side by side reach 4\d\d\d m from zero.*Name fewer maps"):
         side_by_side([made[0]] * 80)
+
+
+LONG = dataclasses.replace(WHILL_CR, name="long", body_length=4.2, body_width=1.1)
+
+
+def test_a_wheelchair_needs_of_a_map_what_it_always_needed():
+    assert reach_of(WHILL_CR) == reach_of(WHILL_CR, farthest_move(WHILL_CR, 1.67, 1.68, 0.1)) == Reach()
+    assert MapGoal(v_max=1.67).for_vehicle(WHILL_CR).reach == Reach()
+    own = MapGoal(passing=0.7, standing=1.3, near=3.0).for_vehicle(WARTHOG)
+    assert (own.passing, own.standing, own.near) == (0.7, 1.3, 3.0)
+
+
+@pytest.mark.parametrize("spec", [WHILL_CR, WARTHOG, LONG], ids=lambda spec: spec.name)
+def test_a_vehicle_of_any_size_meets_walls_with_its_nose(spec):
+    cells = np.full((300, 400), OCCUPIED, np.uint8)
+    cells[20:-20, 20:-20] = FREE
+    made = make_map_scene(GridMap(cells, 0.05, (0.0, 0.0, 0.0)), reach_of(spec))  # its last wall is at x = 19 m
+    scene, _ = map_scene_sampler(made)(jax.random.key(0))
+    middle = 19.0 - spec.body_length / 2 + spec.reference_x  # of the driven axle
+
+    def nose_at(x):
+        return footprint(spec, middle + x, 7.6, 0.0)
+
+    for x in (0.02, 0.3):
+        assert bool(touches(nose_at(x), obstacles_of(scene, nose_at(x).x, 7.6)))
+    for x in (-0.02, -0.3):
+        assert not bool(touches(nose_at(x), obstacles_of(scene, nose_at(x).x, 7.6)))
+        assert float(free_distance(nose_at(x), scene)) == pytest.approx(-x, abs=1e-3)
+
+
+@pytest.mark.parametrize("length", [1.52, 3.0])
+def test_a_large_vehicle_starts_where_it_can_turn(length):
+    spec = dataclasses.replace(WARTHOG, body_length=length)
+    task = MapGoal(map="made:0").for_vehicle(spec)
+
+    @jax.jit
+    @jax.vmap
+    def clear(key):
+        world = task.sample_world(key)
+        turned = jnp.linspace(-np.pi, np.pi, 9)
+        return jax.vmap(lambda yaw: free_distance(footprint(spec, *world.start[:2], yaw), world.scene))(turned)
+
+    assert float(clear(jax.random.split(jax.random.key(1), 256)).min()) > 0.0
+
+
+def test_a_vehicle_that_fits_nowhere_is_refused_with_the_fields_that_say_so():
+    with pytest.raises(ValueError, match=r"map made:1: .*needs 5.17 m.*passing is 5.17 m .*body_width needs.*standing"):
+        check_world(MapGoal(map="made:1").for_vehicle(dataclasses.replace(WHILL_CR, body_width=10.0)))
+    with pytest.raises(ValueError, match=r"map made:0: .* m of clearance where 9.92 m are needed.*body_length"):
+        check_world(MapGoal(map="made:0").for_vehicle(dataclasses.replace(WHILL_CR, body_length=19.0)))
+
+
+def test_a_task_whose_walls_are_listed_too_near_for_the_vehicle_is_refused():
+    @dataclasses.dataclass(frozen=True)
+    class Walled(Task):
+        near: float = 1.2
+
+        def sample_world(self, key):
+            world = super().sample_world(key)
+            walls = map_walls(np.array([[[4.0, 3.0], [4.0, -3.0]]]), keep=1, near=self.near)
+            boxes = stack_boxes([world.scene.boxes, no_boxes(1)])
+            return dataclasses.replace(world, scene=dataclasses.replace(world.scene, boxes=boxes, walls=walls))
+
+    with pytest.raises(ValueError, match=r"'walled'.*within 1.2 m.*'long'.*body_length 4.2 m.*needs 2.31 m.*near="):
+        make_env(Walled(), LONG)
+    assert make_env(Walled(near=2.4), LONG)[0].model.spec is LONG

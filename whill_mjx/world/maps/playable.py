@@ -70,7 +70,7 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN,
 
     Args:
         grid: from `load_map` or `load_footprints`.
-        reach: what the vehicle needs.
+        reach: what the vehicle needs (`reach_of`); None takes a WHILL Model CR.
         keep: walls that an image shows at most.
         seed: of the places.
 
@@ -91,7 +91,7 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN,
             f"{reach.passing:g} m. Check the resolution and the thresholds."
         )
     places = draw_places(grid, space, reach, seed=seed)
-    return MapScene(grid, space, map_walls(straight_walls(grid, space), keep), places)
+    return MapScene(grid, space, map_walls(straight_walls(grid, space), keep, near=reach.near), places)
 
 
 def map_scene_sampler(made: Any) -> Callable[[jax.Array], tuple[Scene, jax.Array]]:

@@ -63,7 +63,7 @@ def side_by_side(scenes: Sequence[MapScene]) -> MapGroup:
                          f"so they may reach {FARTHEST:g} m. Name fewer maps.")
     pairs = list(zip(scenes, shifts, strict=True))
     walls = map_walls(np.concatenate([one.walls.segments + shift for one, shift in pairs]), first.walls.keep,
-                      first.walls.height)  # fmt: skip
+                      first.walls.height, max(one.walls.within for one in scenes))  # fmt: skip
     places = Places(
         start=np.concatenate([one.places.start + np.append(shift, 0.0) for one, shift in pairs]),
         goal=np.concatenate([one.places.goal + shift for one, shift in pairs]),

@@ -115,7 +115,8 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
 
 def _check_corners(faces: Any, count: int) -> None:
     """ValueError where a face (F, 3) names a corner that is not there."""
-    wrong = [] if faces is None else np.asarray(faces)[(np.asarray(faces) < 0) | (np.asarray(faces) >= count)]
+    corners = np.zeros(0, int) if faces is None else np.asarray(faces)
+    wrong = corners[(corners < 0) | (corners >= count)]
     if len(wrong):
         raise ValueError(f"a face has the corner {int(wrong[0])}, and the corners are 0 to {count - 1}")
 
@@ -253,9 +254,13 @@ def _most_common(height: np.ndarray, weight: np.ndarray) -> float:
     """The lowest height [m] at which at least half as much lies as at the commonest one: ceilings are above."""
     bins, index = np.unique(np.floor(height / LEVEL), return_inverse=True)  # few, however far apart they lie
     amount = np.bincount(index, weight)
-    borders = np.union1d(bins, bins - 1)  # a floor may lie on the border of two bins
-    both = sum(np.where(np.isin(one, bins), amount[np.searchsorted(bins, one).clip(max=len(bins) - 1)], 0.0)
-               for one in (borders, borders + 1))  # fmt: skip
-    first = borders[np.argmax(both >= 0.5 * both.max())]
+    pairs = np.union1d(bins, bins - 1)  # a floor may lie on the border of two bins
+
+    def amount_in(wanted: np.ndarray) -> np.ndarray:
+        place = np.searchsorted(bins, wanted).clip(max=len(bins) - 1)
+        return np.where(bins[place] == wanted, amount[place], 0.0)
+
+    both = amount_in(pairs) + amount_in(pairs + 1)
+    first = pairs[np.argmax(both >= 0.5 * both.max())]
     chosen = np.isin(bins[index], (first, first + 1))
     return float(np.average(height[chosen], weights=weight[chosen]))
