@@ -220,6 +220,14 @@ def test_a_part_of_a_scene_may_not_borrow_the_corners_of_another(tmp_path):
         read_map(tmp_path / "room.glb")
 
 
+@pytest.mark.parametrize("line", ["v 1 2", "v 1"])
+def test_corners_that_lack_a_number_are_refused(tmp_path, line):
+    file = tmp_path / "room.obj"
+    file.write_text("".join(f"{line}\n" for _ in range(12)) + "f 1 2 3\n")
+    with pytest.raises(ValueError, match=r"room.obj: cannot be read as .obj .*Export it again"):
+        read_map(file)
+
+
 @pytest.mark.parametrize("height", [-1e9, 1e9, -1e30])
 def test_a_point_far_below_or_above_leaves_the_map_as_it_is(tmp_path, height):
     points = cloud_of_a_room()

@@ -103,7 +103,7 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
     if not parts:
         raise ValueError("there is no geometry in it")
     for part in parts:  # before they become one mesh, in which a wrong corner may be another part's
-        _check_corners(getattr(part, "faces", None), len(part.vertices))
+        _check_corners(np.shape(part.vertices), getattr(part, "faces", None))
     if isinstance(loaded, trimesh.Scene):
         loaded = loaded.to_mesh()
     points = np.asarray(loaded.vertices, float)
@@ -113,12 +113,14 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
     return points, None if faces is None or not len(faces) else np.asarray(faces)
 
 
-def _check_corners(faces: Any, count: int) -> None:
-    """ValueError where a face (F, 3) names a corner that is not there."""
+def _check_corners(shape: tuple[int, ...], faces: Any) -> None:
+    """ValueError where corners of this shape are no (N, 3), or a face (F, 3) names one that is not there."""
+    if shape[1:] != (3,):
+        raise ValueError(f"corners of shape {shape}; (N, 3) numbers are needed")
     corners = np.zeros(0, int) if faces is None else np.asarray(faces)
-    wrong = corners[(corners < 0) | (corners >= count)]
+    wrong = corners[(corners < 0) | (corners >= shape[0])]
     if len(wrong):
-        raise ValueError(f"a face has the corner {int(wrong[0])}, and the corners are 0 to {count - 1}")
+        raise ValueError(f"a face has the corner {int(wrong[0])}, and the corners are 0 to {shape[0] - 1}")
 
 
 def _pcd(data: bytes) -> tuple[np.ndarray, None]:
