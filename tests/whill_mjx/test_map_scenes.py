@@ -445,3 +445,13 @@ def test_a_task_whose_walls_are_listed_too_near_for_the_vehicle_is_refused():
     with pytest.raises(ValueError, match=r"'walled'.*within 1.2 m.*'long'.*body_length 4.2 m.*needs 2.31 m.*near="):
         make_env(Walled(), LONG)
     assert make_env(Walled(near=2.4), LONG)[0].model.spec is LONG
+
+
+def test_a_task_for_a_vehicle_must_be_a_task():
+    @dataclasses.dataclass(frozen=True)
+    class Own(Task):
+        def for_vehicle(self, spec):
+            return spec
+
+    with pytest.raises(ValueError, match="task 'own': for_vehicle: returns VehicleSpec; it must be a Task"):
+        make_env(Own())

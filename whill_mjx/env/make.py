@@ -71,7 +71,10 @@ def make_env(
         task = dataclasses.replace(task, layout=layout)
     check_task(task)
     spec, params = as_vehicle(vehicle)
-    task = task.for_vehicle(spec)
+    task, asked = task.for_vehicle(spec), task
+    if not isinstance(task, Task):
+        raise ValueError(f"task {asked.name!r}: for_vehicle: returns {type(task).__name__}; it must be a Task. Correct "
+                         "the method.")
     chosen = task.observations() if observations is None else observations
     if looks is not None:
         random_looks = photometric = None
