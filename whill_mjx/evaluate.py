@@ -235,6 +235,7 @@ def make_course(options: EvaluateOptions, task: Task, policy: PolicyFile | None,
     looks = {"task": None, "on": "paper", "off": "plain"}.get(options.looks, options.looks)
     height, width = (policy.height or 64, policy.width or 64) if policy else (64, 64)
     env, params = make_env(task, chosen, height=height, width=width, looks=looks)
+    check_world(env.task)  # of this vehicle, which a map may not have room for
     rate = 1.0 / env.model.config.control_dt
     if policy and abs(policy.rate_hz - rate) > 1e-6:
         raise ValueError(f"{policy.path}/policy.json: rate_hz is {policy.rate_hz}; the simulator runs at {rate:g} Hz. "

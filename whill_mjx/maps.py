@@ -52,13 +52,16 @@ def main(options: Import) -> None:
     size = np.array(grid.cells.shape[::-1]) * grid.resolution
     steps, places = len(wall_segments(grid)), made.places
     print(f"{options.file}: {size[0]:.1f} x {size[1]:.1f} m in cells of {grid.resolution:g} m")
+    if grid.shift != (0.0, 0.0):
+        print("moved to zero: add {:.0f}, {:.0f} m to x, y of the scene for those of the file".format(*grid.shift))
     print(f"free and within reach: {made.space.sum() * grid.resolution**2:.0f} m2")
     print(f"walls: {len(made.walls.segments)} straight ones, from {steps} edges of cells")
     print(f"starts and goals: {len(places.way)} pairs, {places.way.min():.1f} to {places.way.max():.1f} m apart")
     import io
 
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, walls=made.walls.segments, start=places.start, goal=places.goal, way=places.way)
+    np.savez_compressed(buffer, walls=made.walls.segments, start=places.start, goal=places.goal, way=places.way,
+                        shift=grid.shift)
     write_whole(arrays, buffer.getvalue())
     note_written(arrays)
     write_whole(picture, from_above(made, options.pixels))

@@ -72,8 +72,9 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         from sysid import load_any
 
         load_any(options.log)
-    check_world(preset.task)
-    check_memory(preset, options.learner, make_env(preset.task)[0])
+    env, _ = make_env(preset.task, options.vehicle)
+    check_world(env.task)  # of this vehicle, which a map may not have room for
+    check_memory(preset, options.learner, env)
     if any(text != "fit" for text in preset.vary):
         variations_of([text for text in preset.vary if text != "fit"], None)
     if "fit" in preset.vary and options.vehicle is not None:

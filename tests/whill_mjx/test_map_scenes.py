@@ -12,12 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from whill_mjx import maps
 from whill_mjx.env import make_env, observe, reset_state, step_state
 from whill_mjx.learning.identity import identity_of
 from whill_mjx.learning.setup import find_preset
+from whill_mjx.tasks.base import Task
+from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.map_goal import MapGoal
 from whill_mjx.vehicle.kinematics import reference_pose
-from whill_mjx.world.collision import obstacles_of, touches
+from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR
+from whill_mjx.world.collision import free_distance, obstacles_of, touches
 from whill_mjx.world.maps import (
     FREE,
     OCCUPIED,
@@ -26,18 +30,21 @@ from whill_mjx.world.maps import (
     Reach,
     cast,
     load_footprints,
+    load_map,
     make_map_scene,
     map_scene_sampler,
     picture,
+    reach_of,
     read_map,
     shown,
 )
 from whill_mjx.world.maps import walls as map_wall_module
+from whill_mjx.world.maps.places import farthest_move
 from whill_mjx.world.maps.several import GAP, side_by_side
 from whill_mjx.world.maps.straight import open_space, outline, straight_walls
 from whill_mjx.world.maps.walls import map_walls, most_seen, wall_boxes
 from whill_mjx.world.render import camera_rotation, pinhole, render_frame
-from whill_mjx.world.scene import footprint
+from whill_mjx.world.scene import footprint, no_boxes, stack_boxes
 
 pytestmark = pytest.mark.quick
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "maps"
@@ -319,3 +326,132 @@ def test_maps_side_by_side_keep_their_walls_places_and_ways():
     places = ways.points.reshape(-1, 2)[listed]
     assert len(listed) and np.all(np.hypot(*(places - ways.start[-1]).T) <= 10.0 + 1e-3)
     assert side_by_side(made[:1]).walls is made[0].walls
+
+
+def written_map(folder, origin, cells=None):
+    """Path of a nav2 map of rooms at an origin."""
+    cells = many_rooms().cells if cells is None else cells
+    (folder / "map.pgm").write_bytes(b"P5 %d %d 255\n" % cells.shape[::-1]
+                                     + np.where(cells[::-1] == FREE, 254, 0).astype(np.uint8).tobytes())
+    path = folder / f"map_{origin[0]}.yaml"
+    path.write_text(f"image: map.pgm\nresolution: 0.05\norigin: {list(origin)}\nnegate: 0\noccupied_thresh: 0.65\n"
+                    "free_thresh: 0.196\n")
+    return path
+
+
+def test_a_map_far_from_zero_is_the_same_one_moved_there_by_whole_metres(tmp_path):
+    near, far = (read_map(written_map(tmp_path, origin)) for origin in ((-10.3, -4.0, 0.4), (499989.7, 900000.0, 0.4)))
+    assert near.shift == (0.0, 0.0) and near.origin == (-10.3, -4.0, 0.4)
+    moved = np.add(far.shift, [-500000.0, -900004.0])
+    assert np.abs(moved).max() < 20 and np.array_equal(moved, np.rint(moved)) and far.farthest() < 20
+    one, other = make_map_scene(near), make_map_scene(far)
+    np.testing.assert_allclose(other.walls.segments + moved, one.walls.segments, atol=1e-5)
+    np.testing.assert_allclose(other.places.start[:, :2] + moved, one.places.start[:, :2], atol=1e-6)
+    np.testing.assert_array_equal(load_map(tmp_path / "map_499989.7.yaml").origin, far.origin)
+
+
+def test_the_command_says_and_writes_by_how_much_it_moved_a_far_map(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(0, [12.0, 9.0], (60_000, 2)), np.zeros(60_000)])
+    np.save(tmp_path / "site.npy", floor + [691_600.0, 5_334_700.0, 519.0])  # UTM
+    maps.main(maps.Import(tmp_path / "site.npy", tmp_path / "scene", pixels=200))
+    with np.load(tmp_path / "scene.npz") as arrays:
+        places = arrays["start"][:, :2] + arrays["shift"]
+        assert np.abs(arrays["walls"]).max() < 10.0
+    assert (places > [691_600.0, 5_334_700.0]).all() and (places < [691_612.0, 5_334_709.0]).all()
+    assert "add 691606, 5334704 m to x, y" in capsys.readouterr().out.replace("5334705", "5334704")
+
+
+def test_a_map_that_reaches_too_far_is_refused_with_the_remedy():
+    far = dataclasses.replace(many_rooms(), origin=(0.0, 9000.0, 0.0))
+    with pytest.raises(ValueError, match=r"corners lie 9008 m from zero.* 4096 m.*brought_near\(\)"):
+        make_map_scene(far)
+    assert len(make_map_scene(far.brought_near()).walls.segments) > 40
+    with pytest.raises(ValueError, match=r"corners lie 10000 m from zero.*Cut it into smaller ones\.$"):
+        make_map_scene(dataclasses.replace(many_rooms(), resolution=50.0, origin=(-1e4, 0.0, 0.0)))
+
+
+def test_maps_of_other_places_come_side_by_side_and_not_kilometres_apart():
+    plan = read_map("made:0")
+    made = [make_map_scene(dataclasses.replace(plan, origin=(0.0, y, 0.0)), Reach(farthest=6.0)) for y in (0.0, 900.0)]
+    group = side_by_side(made)
+    assert np.ptp(group.walls.segments.reshape(-1, 2), 0)[1] == pytest.approx(np.ptp(made[0].walls.segments[..., 1]))
+    np.testing.assert_allclose(group.places.start[-1, :2] - group.shifts[1], made[1].places.start[-1, :2], atol=1e-6)
+    with pytest.raises(ValueError, match=r"80 maps side by side reach 4\d\d\d m from zero.*Name fewer maps"):
+        side_by_side([made[0]] * 80)
+
+
+LONG = dataclasses.replace(WHILL_CR, name="long", body_length=4.2, body_width=1.1)
+
+
+def test_a_wheelchair_needs_of_a_map_what_it_always_needed():
+    assert reach_of(WHILL_CR) == reach_of(WHILL_CR, farthest_move(WHILL_CR, 1.67, 1.68, 0.1)) == Reach()
+    assert MapGoal(v_max=1.67).for_vehicle(WHILL_CR).reach == Reach()
+    own = MapGoal(passing=0.7, standing=1.3, near=3.0).for_vehicle(WARTHOG)
+    assert (own.passing, own.standing, own.near) == (0.7, 1.3, 3.0)
+
+
+@pytest.mark.parametrize("spec", [WHILL_CR, WARTHOG, LONG], ids=lambda spec: spec.name)
+def test_a_vehicle_of_any_size_meets_walls_with_its_nose(spec):
+    cells = np.full((300, 400), OCCUPIED, np.uint8)
+    cells[20:-20, 20:-20] = FREE
+    made = make_map_scene(GridMap(cells, 0.05, (0.0, 0.0, 0.0)), reach_of(spec))  # its last wall is at x = 19 m
+    scene, _ = map_scene_sampler(made)(jax.random.key(0))
+    middle = 19.0 - spec.body_length / 2 + spec.reference_x  # of the driven axle
+
+    def nose_at(x):
+        return footprint(spec, middle + x, 7.6, 0.0)
+
+    for x in (0.02, 0.3):
+        assert bool(touches(nose_at(x), obstacles_of(scene, nose_at(x).x, 7.6)))
+    for x in (-0.02, -0.3):
+        assert not bool(touches(nose_at(x), obstacles_of(scene, nose_at(x).x, 7.6)))
+        assert float(free_distance(nose_at(x), scene)) == pytest.approx(-x, abs=1e-3)
+
+
+@pytest.mark.parametrize("length", [1.52, 3.0])
+def test_a_large_vehicle_starts_where_it_can_turn(length):
+    spec = dataclasses.replace(WARTHOG, body_length=length)
+    task = MapGoal(map="made:0").for_vehicle(spec)
+
+    @jax.jit
+    @jax.vmap
+    def clear(key):
+        world = task.sample_world(key)
+        turned = jnp.linspace(-np.pi, np.pi, 9)
+        return jax.vmap(lambda yaw: free_distance(footprint(spec, *world.start[:2], yaw), world.scene))(turned)
+
+    assert float(clear(jax.random.split(jax.random.key(1), 256)).min()) > 0.0
+
+
+def test_a_vehicle_that_fits_nowhere_is_refused_with_the_fields_that_say_so():
+    with pytest.raises(ValueError, match=r"map made:1: .*needs 5.17 m.*passing is 5.17 m .*body_width needs.*standing"):
+        check_world(MapGoal(map="made:1").for_vehicle(dataclasses.replace(WHILL_CR, body_width=10.0)))
+    with pytest.raises(ValueError, match=r"map made:0: .* m of clearance where 9.92 m are needed.*body_length"):
+        check_world(MapGoal(map="made:0").for_vehicle(dataclasses.replace(WHILL_CR, body_length=19.0)))
+
+
+def test_a_task_whose_walls_are_listed_too_near_for_the_vehicle_is_refused():
+    @dataclasses.dataclass(frozen=True)
+    class Walled(Task):
+        near: float = 1.2
+
+        def sample_world(self, key):
+            world = super().sample_world(key)
+            walls = map_walls(np.array([[[4.0, 3.0], [4.0, -3.0]]]), keep=1, near=self.near)
+            boxes = stack_boxes([world.scene.boxes, no_boxes(1)])
+            return dataclasses.replace(world, scene=dataclasses.replace(world.scene, boxes=boxes, walls=walls))
+
+    with pytest.raises(ValueError, match=r"'walled'.*within 1.2 m.*'long'.*body_length 4.2 m.*needs 2.31 m.*near="):
+        make_env(Walled(), LONG)
+    assert make_env(Walled(near=2.4), LONG)[0].model.spec is LONG
+
+
+def test_a_task_for_a_vehicle_must_be_a_task():
+    @dataclasses.dataclass(frozen=True)
+    class Own(Task):
+        def for_vehicle(self, spec):
+            return spec
+
+    with pytest.raises(ValueError, match="task 'own': for_vehicle: returns VehicleSpec; it must be a Task"):
+        make_env(Own())

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from whill_mjx.world.maps import FREE, OCCUPIED, read_map
+from whill_mjx.world.maps import FREE, OCCUPIED, read_map, surfaces
 from whill_mjx.world.maps.surfaces import _lzf
 
 pytestmark = pytest.mark.quick
@@ -129,3 +129,109 @@ def test_the_command_imports_a_cloud(tmp_path):
     done = subprocess.run([sys.executable, "-m", "whill_mjx.maps", "import", "room.npy", "--out", "room"],
                           cwd=tmp_path, capture_output=True, text=True, check=True)  # fmt: skip
     assert "starts and goals" in done.stdout and (tmp_path / "room.png").stat().st_size > 1000
+
+
+def rebuilt(tmp_path, *more, name="building.stl"):
+    """Grid of a room of 8 x 6 m with further boxes, each of a size and a centre [m]."""
+    import trimesh
+
+    tall = 2.5
+    room = [((8, 6, 0.2), (4, 3, -0.1)), *[((8.2, 0.2, tall), (4, y, tall / 2)) for y in (0, 6)],
+            *[((0.2, 6, tall), (x, 3, tall / 2)) for x in (0, 8)]]  # fmt: skip
+    parts = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in (*room, *more)]
+    trimesh.util.concatenate(parts).export(tmp_path / name)
+    return read_map(tmp_path / name)
+
+
+def kind_at(grid, x, y):
+    column, row = ((np.array([x, y]) - grid.origin[:2]) / grid.resolution).astype(int)
+    return grid.cells[row, column]
+
+
+@pytest.mark.parametrize("low, high, kind", [
+    (0.72, 0.75, OCCUPIED),  # a table
+    (0.135, 0.165, OCCUPIED),  # a board
+    (0.0, 0.16, OCCUPIED),  # a step too high
+    (1.30, 1.32, OCCUPIED),
+    (0.0, 0.11, FREE),  # a mat
+    (1.52, 1.55, FREE),  # a lamp
+])  # fmt: skip
+def test_what_lies_level_between_step_and_headroom_is_in_the_way_everywhere(tmp_path, low, high, kind):
+    grid = rebuilt(tmp_path, ((1.6, 1.2, high - low), (4.0, 3.0, (low + high) / 2)))
+    for x, y in ((4.03, 3.03), (3.33, 2.53), (4.67, 3.47)):
+        assert kind_at(grid, x, y) == kind
+    assert kind_at(grid, 2.0, 2.0) == kind_at(grid, 4.03, 4.2) == FREE
+
+
+def test_a_gentle_ramp_is_free_up_to_a_step_above_the_floor_and_in_the_way_beyond(tmp_path):
+    import trimesh
+
+    rebuilt(tmp_path)
+    corners = [[3, 2, 0], [7, 2, 0.32], [7, 4, 0.32], [3, 4, 0]]  # 8 %: it comes to 0.12 m at x = 4.5
+    strips = [trimesh.Trimesh([[x, 2, z], [x + 0.25, 2, z + 0.02], [x + 0.25, 4, z + 0.02], [x, 4, z]],
+                              [[0, 1, 2], [0, 2, 3]])
+              for x, z in ((3 + 0.25 * k, 0.02 * k) for k in range(16))]  # fmt: skip
+    assert strips[-1].vertices[1].tolist() == pytest.approx(corners[1])
+    trimesh.util.concatenate([trimesh.load(tmp_path / "building.stl"), *strips]).export(tmp_path / "ramp.stl")
+    grid = read_map(tmp_path / "ramp.stl")
+    assert all(kind_at(grid, x, 3.03) == FREE for x in np.arange(2.05, 4.4, 0.1))
+    assert all(kind_at(grid, x, 3.03) == OCCUPIED for x in np.arange(4.65, 6.9, 0.1))
+
+
+def test_a_face_between_two_levels_is_cut_to_its_part_there():
+    corners = np.array([[[0.0, 0, 0], [4, 0, 2], [0, 4, 0]], [[0, 0, 5], [1, 0, 6], [0, 1, 7]]])
+    (cut,) = surfaces._between(corners, 0.5, 1.5)  # the other one lies above
+    x, y = cut.T
+    assert x.min() == pytest.approx(1.0) and x.max() == pytest.approx(3.0)
+    assert abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2 == pytest.approx(4.0)  # 3 * 3 / 2 - 1 / 2
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 12
+property float x
+property float y
+property float z
+element face 2
+property list uchar int vertex_indices
+end_header
+"""
+
+
+@pytest.mark.parametrize("corner", [-1, 12, 4000])
+def test_a_face_with_a_corner_that_is_not_there_is_refused(tmp_path, corner):
+    file = tmp_path / "room.ply"
+    file.write_text(PLY + "".join(f"{k % 4} {k // 4} 0\n" for k in range(12)) + f"3 0 1 4\n3 1 5 {corner}\n")
+    with pytest.raises(ValueError, match=rf"room.ply.*corner {corner}, and the corners are 0 to 11\). Export it again"):
+        read_map(file)
+
+
+def test_a_part_of_a_scene_may_not_borrow_the_corners_of_another(tmp_path):
+    import trimesh
+
+    parts = trimesh.Scene([trimesh.creation.box((6, 4, 0.2)), trimesh.creation.box((1, 1, 1))])
+    data = parts.export(file_type="glb")
+    faces = np.asarray(parts.geometry["geometry_0"].faces, "<u4")
+    wrong = faces.copy()
+    wrong[3, 1] = 9  # of 8; the first part would take it from the second
+    assert faces.tobytes() in data
+    (tmp_path / "room.glb").write_bytes(data.replace(faces.tobytes(), wrong.tobytes()))
+    with pytest.raises(ValueError, match=r"room.glb.*the corner 9, and the corners are 0 to 7"):
+        read_map(tmp_path / "room.glb")
+
+
+@pytest.mark.parametrize("line", ["v 1 2", "v 1"])
+def test_corners_that_lack_a_number_are_refused(tmp_path, line):
+    file = tmp_path / "room.obj"
+    file.write_text("".join(f"{line}\n" for _ in range(12)) + "f 1 2 3\n")
+    with pytest.raises(ValueError, match=r"room.obj: cannot be read as .obj .*Export it again"):
+        read_map(file)
+
+
+@pytest.mark.parametrize("height", [-1e9, 1e9, -1e30])
+def test_a_point_far_below_or_above_leaves_the_map_as_it_is(tmp_path, height):
+    points = cloud_of_a_room()
+    np.save(tmp_path / "room.npy", points)
+    np.save(tmp_path / "struck.npy", np.vstack([points, [3.02, 2.02, height]]))
+    plain, struck = (read_map(tmp_path / name) for name in ("room.npy", "struck.npy"))
+    np.testing.assert_array_equal(struck.cells, plain.cells)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.vehicle.vehicle_file import load_vehicle
+from whill_mjx.world.maps.places import farthest_move
+from whill_mjx.world.scene import MapWalls
 
 LOOKS = ("plain", "paper", "rich")
 """What changes the picture from episode to episode: nothing, what the paper randomises, a furnished room."""
@@ -68,6 +71,10 @@ def make_env(
         task = dataclasses.replace(task, layout=layout)
     check_task(task)
     spec, params = as_vehicle(vehicle)
+    task, asked = task.for_vehicle(spec), task
+    if not isinstance(task, Task):
+        raise ValueError(f"task {asked.name!r}: for_vehicle: returns {type(task).__name__}; it must be a Task. Correct "
+                         "the method.")
     chosen = task.observations() if observations is None else observations
     if looks is not None:
         random_looks = photometric = None
@@ -93,8 +100,22 @@ def _check_own(env: Env, params: VehicleParams) -> None:
     if own or not type(env.task).__module__.startswith("whill_mjx."):
         bare = dataclasses.replace(env, sensors=())
         state, _ = jax.eval_shape(lambda seed: reset(bare, params, jax.random.key(seed)), 0)
+        _check_walls(env, state.scene.walls)
         for name, sensor in own.items():
             check_sensor(name, sensor, lambda state: view_of(env, params, state), state)
+
+
+def _check_walls(env: Env, walls: MapWalls | None) -> None:
+    """Refuse walls of a map that are listed too near for the vehicle: it would drive into them before it meets them."""
+    task, spec = env.task, env.model.spec
+    speed = max(abs(task.v_min), abs(task.v_max))
+    moves = farthest_move(spec, speed, task.omega_max, env.model.config.control_dt)
+    needed = math.hypot(spec.body_length, spec.body_width) / 2 + moves
+    if walls is not None and walls.within < needed:
+        raise ValueError(f"task {task.name!r}: sample_world: the walls of its map are listed within "
+                         f"{walls.within:g} m, and the vehicle {spec.name!r}, with body_length {spec.body_length:g} m "
+                         f"and body_width {spec.body_width:g} m, needs {needed:.2f} m. Make them with map_walls(..., "
+                         "near=...), or with make_map_scene(grid, reach_of(spec)) in for_vehicle.")
 
 
 def _looks_of(task: Task, looks: str | None) -> str:

@@ -19,6 +19,7 @@ from whill_mjx.io.fields import BUDGET, TASK, Field, check_fields
 from whill_mjx.tasks import terms
 from whill_mjx.tasks.parts import Draws, make_marker, room
 from whill_mjx.tasks.terms import Moment
+from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.world.people.crowd import Crowd, People
 from whill_mjx.world.people.places import in_sight
 from whill_mjx.world.scene import Scene, default_looks
@@ -177,6 +178,10 @@ class Task:
     def populate(self, key: jax.Array, world: World) -> People:
         """The `people` of an episode: they walk to and fro between points in sight of each other."""
         return in_sight(key, world.scene, world.start, self.crowd)
+
+    def for_vehicle(self, spec: VehicleSpec) -> Task:
+        """The task as a vehicle of this size needs it; `make_env` takes it for its vehicle. By default as it is."""
+        return self
 
     def goal(self, scene: Scene) -> jax.Array:
         """(2,) m: where to go; `Moment.goal_distance` is measured to it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,10 +16,16 @@ from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.tasks.base import Task, World
-from whill_mjx.world.maps import GridMap, Reach, make_map_scene, map_scene_sampler, read_map
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.world.maps import GridMap, Reach, make_map_scene, map_scene_sampler, reach_of, read_map
+from whill_mjx.world.maps.places import farthest_move
 from whill_mjx.world.maps.several import MapGroup, side_by_side
 from whill_mjx.world.maps.ways import Ways, people_near
 from whill_mjx.world.people.crowd import Crowd, People
+
+APART = 0.5
+"""Least distance of people at the start from where the vehicle turns on the spot [m]."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +36,7 @@ class MapGoal(Task):
     rising: ClassVar[tuple[str, ...]] = ("nearest", "farthest")
     ranges: ClassVar[tuple[Field, ...]] = (
         Field("nearest", "m", 0.0, 1e4), Field("farthest", "m", 0.01, 1e4),
+        Field("passing", "m", 0.0, 100.0), Field("standing", "m", 0.0, 100.0), Field("near", "m", 0.0, 100.0),
     )  # fmt: skip
     walls: ClassVar[int] = 0
 
@@ -45,10 +53,32 @@ class MapGoal(Task):
     """Shortest way to a goal [m]."""
     farthest: float = 12.0
     """Longest way to a goal [m]."""
+    passing: float = 0.0
+    """Clearance on the way [m]; 0 takes what the width of the vehicle needs."""
+    standing: float = 0.0
+    """Clearance at start and goal [m]; 0 takes what the vehicle needs to turn on the spot."""
+    near: float = 0.0
+    """Least distance from the vehicle's middle within which walls are met [m]; the size of the vehicle may raise it."""
+
+    def for_vehicle(self, spec: VehicleSpec) -> MapGoal:
+        """With the clearances that a vehicle of this size needs, where the fields leave them open."""
+        moves = farthest_move(spec, max(abs(self.v_min), abs(self.v_max)), self.omega_max, VehicleConfig().control_dt)
+        needed = reach_of(spec, moves)
+        return dataclasses.replace(
+            self, passing=self.passing or needed.passing, standing=self.standing or needed.standing,
+            near=max(self.near, needed.near),
+        )  # fmt: skip
+
+    @property
+    def reach(self) -> Reach:
+        """What the vehicle needs of the map: a WHILL Model CR where none is given."""
+        chair = Reach()
+        return Reach(self.passing or chair.passing, self.standing or chair.standing, self.nearest, self.farthest,
+                     self.near or chair.near)
 
     def sample_world(self, key: jax.Array) -> World:
         """One of the map's pairs of start and goal; always the same in a fixed layout."""
-        sample = _sampler(self.map, self.nearest, self.farthest)
+        sample = _sampler(self.map, self.reach)
         scene, start = sample(key if self.randomised else jax.random.key(0))
         return World(scene, start)
 
@@ -61,7 +91,7 @@ class MapGoal(Task):
 
     def populate(self, key: jax.Array, world: World) -> People:
         """People on ways of the map that lead past the start."""
-        ways = _ways(self.map, self.nearest, self.farthest, self.people_within)
+        ways = _ways(self.map, self.reach, self.people_within)
         return people_near(key, ways, world.start, self.crowd)
 
     def observations(self) -> Mapping[str, Any]:
@@ -77,16 +107,24 @@ def _grids(paths: str) -> list[GridMap]:
 
 
 @lru_cache(maxsize=8)
-def _made(paths: str, nearest: float, farthest: float) -> MapGroup:
-    reach = Reach(nearest=nearest, farthest=farthest)
-    return side_by_side([make_map_scene(grid, reach) for grid in _grids(paths)])
+def _made(paths: str, reach: Reach) -> MapGroup:
+    scenes = []
+    for name, grid in zip(paths.split(","), _grids(paths), strict=True):
+        try:
+            scenes.append(make_map_scene(grid, reach))
+        except ValueError as error:
+            raise ValueError(f"map {name.strip()}: {error} The task's field passing is {reach.passing:g} m (0 takes "
+                             f"what the vehicle's body_width needs), and standing {reach.standing:g} m (0 takes what "
+                             "body_length and body_width need).") from None  # fmt: skip
+    return side_by_side(scenes)
 
 
 @lru_cache(maxsize=8)
-def _sampler(paths: str, nearest: float, farthest: float) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
-    return map_scene_sampler(_made(paths, nearest, farthest))
+def _sampler(paths: str, reach: Reach) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
+    return map_scene_sampler(_made(paths, reach))
 
 
 @lru_cache(maxsize=8)
-def _ways(paths: str, nearest: float, farthest: float, within: float) -> Ways:
-    return _made(paths, nearest, farthest).ways(Crowd().clear, within)
+def _ways(paths: str, reach: Reach, within: float) -> Ways:
+    clear = max(Crowd().clear, reach.standing + APART)
+    return _made(paths, reach).ways(clear, within)

@@ -74,6 +74,8 @@ class MapWalls:
     """Edge of its squares [m]."""
     shape: tuple[int, int]
     """Its rows and columns."""
+    within: float
+    """How far from any place of a square the walls are listed [m]."""
 
     def cell(self, x: jax.Array, y: jax.Array) -> jax.Array:
         """Line of `near` for a place; the nearest square for one outside."""

@@ -19,7 +19,7 @@ from whill_mjx.world.maps.field import DistanceField, distance_at, distance_fiel
 from whill_mjx.world.maps.footprints import load_footprints
 from whill_mjx.world.maps.grid import FREE, OCCUPIED, UNKNOWN, GridMap, wall_segments
 from whill_mjx.world.maps.nav2 import load_map
-from whill_mjx.world.maps.places import Places, Reach
+from whill_mjx.world.maps.places import Places, Reach, reach_of
 from whill_mjx.world.maps.playable import MapScene, make_map_scene, map_scene_sampler, read_map
 from whill_mjx.world.maps.walls import cast, nearest_walls, shown
 
@@ -42,6 +42,7 @@ __all__ = [
     "map_scene_sampler",
     "nearest_walls",
     "read_map",
+    "reach_of",
     "shown",
     "wall_segments",
 ]

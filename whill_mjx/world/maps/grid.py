@@ -1,17 +1,21 @@
 """Occupancy grids: what is free, unknown and occupied, and the borders of the free space.
 
-World frame: that of the map's file, x and y in m. The origin's yaw turns the grid about its lower left corner, as
-map_server defines it. Everything here is the host's work, in numpy.
+World frame: that of the map's file, x and y in m; a map that lies far from its zero is moved to it (`brought_near`).
+The origin's yaw turns the grid about its lower left corner, as map_server defines it. Everything here is the host's
+work, in numpy.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 FREE, UNKNOWN, OCCUPIED = 0, 1, 2
+NEAR, FARTHEST = 1000.0, 4096.0
+"""Coordinates up to which a map stays where its file has it, and beyond which nothing drives [m]. Poses are in single
+precision: `docs/maps.md` says what a drive loses there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +30,30 @@ class GridMap:
     """x [m], y [m], yaw [rad] of the lower left corner of the grid."""
     occupancy: np.ndarray | None = None
     """(rows, columns) int8: the values of nav2's OccupancyGrid, 0 to 100 and -1 for unknown; None of made grids."""
+    shift: tuple[float, float] = (0.0, 0.0)
+    """Whole metres x, y that were taken off the file's coordinates; added to a place, they give the file's own."""
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         """World coordinates (..., 2) of points (..., 2) in the grid's own frame [m]."""
         x, y, yaw = self.origin
         cos, sin = math.cos(yaw), math.sin(yaw)
         return points @ np.array([[cos, sin], [-sin, cos]]) + np.array([x, y])
+
+    def farthest(self) -> float:
+        """Largest coordinate of a corner, whatever its sign [m]."""
+        return float(np.abs(self._corners()).max())
+
+    def brought_near(self) -> GridMap:
+        """The grid with its middle within a metre of zero where a corner lies beyond `NEAR`, else as it is."""
+        if self.farthest() <= NEAR:
+            return self
+        x, y = (float(one) for one in np.rint(self._corners().mean(0)))
+        origin = (self.origin[0] - x, self.origin[1] - y, self.origin[2])
+        return replace(self, origin=origin, shift=(self.shift[0] + x, self.shift[1] + y))
+
+    def _corners(self) -> np.ndarray:
+        rows, columns = self.cells.shape
+        return self.to_world(np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]]) * self.resolution)
 
     def free_points(self) -> np.ndarray:
         """(F, 2) world coordinates of the centres of all free cells."""

@@ -23,7 +23,7 @@ TRUE, FALSE = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 
 
 def load_map(path: str | Path) -> GridMap:
-    """Occupancy grid of a map_server YAML file.
+    """Occupancy grid of a map_server YAML file; one that lies far from zero is moved there (`GridMap.shift`).
 
     Raises:
         ValueError: a field is missing or out of its range, or the image cannot be read; names file and remedy.
@@ -44,7 +44,7 @@ def load_map(path: str | Path) -> GridMap:
     kinds = occupancy_kinds(occupied, free, raw=mode == "raw")
     x, y, yaw = table["origin"]
     occupancy = occupancy[::-1].copy()  # the last row of the image lies at the bottom
-    return GridMap(kinds[occupancy], table["resolution"], (x, y, yaw), occupancy)
+    return GridMap(kinds[occupancy], table["resolution"], (x, y, yaw), occupancy).brought_near()
 
 
 def level_occupancy(mode: str, occupied: float, free: float, negate: bool) -> np.ndarray:

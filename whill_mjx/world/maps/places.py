@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from whill_mjx.world.maps.grid import GridMap
+from whill_mjx.world.maps.walls import NEAR
 
 STEP = 0.2
 """Distance of neighbouring points of the graph of ways, about [m]."""
 AHEAD = 5
 """Points of the way over which a start's direction is taken."""
+ASIDE, TURNING = 0.17, 0.05
+"""Room on each side of a vehicle on its way, and around its farthest corner where it turns on the spot [m]."""
+SEEN = 0.63
+"""Distance from its border at which a vehicle notices walls at least [m]."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """What a vehicle needs of a place [m]."""
+    """What a vehicle needs of a map [m]; the defaults are a WHILL Model CR's, `reach_of` gives those of others."""
 
     passing: float = 0.45
     """Clearance on the way: half the vehicle's width and some room."""
@@ -26,6 +33,28 @@ class Reach:
     """Shortest way from start to goal."""
     farthest: float = 12.0
     """Longest way from start to goal."""
+    near: float = NEAR
+    """How far from the middle of its body walls matter: those that it meets in one step, or whose distance is read."""
+
+
+def reach_of(spec: Any, moves: float = 0.0, **lengths: float) -> Reach:
+    """What a vehicle needs of a map, by its size, in whole centimetres.
+
+    Args:
+        spec: sizes of the vehicle (`whill_mjx.vehicle.specs.VehicleSpec`).
+        moves: how far its body's middle moves in one control period at most [m] (`farthest_move`).
+        lengths: `nearest` and `farthest` of `Reach`.
+    """
+    side, half = spec.body_width / 2, math.hypot(spec.body_length, spec.body_width) / 2
+    corner = math.hypot(abs(spec.reference_x) + spec.body_length / 2, side)  # from the driven axle, on which it turns
+    passing, standing, near = (math.ceil(100 * one - 1e-6) / 100
+                               for one in (side + ASIDE, corner + TURNING, half + max(SEEN, moves)))  # fmt: skip
+    return Reach(passing=passing, standing=standing, near=max(near, NEAR), **lengths)  # people look up walls too
+
+
+def farthest_move(spec: Any, speed: float, yaw_rate: float, duration: float) -> float:
+    """How far [m] the middle of a body moves at most in a time [s], at a speed [m/s] and a yaw rate [rad/s]."""
+    return duration * (abs(speed) + abs(yaw_rate * spec.reference_x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +141,7 @@ def draw_places(
     if not starts:
         raise ValueError(
             f"the map has no start and goal {reach.nearest:g} to {reach.farthest:g} m apart: its widest place has "
-            f"{clear.max():.2f} m of clearance, its longest way is {longest:.1f} m. Ask for less, or check the scale."
+            f"{clear.max():.2f} m of clearance where {reach.standing:g} m are needed, its longest way is "
+            f"{longest:.1f} m. Ask for less, or check the scale."
         )
     return Places(np.concatenate(starts), np.concatenate(ends), np.concatenate(ways))

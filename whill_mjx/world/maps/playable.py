@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.world.maps.footprints import load_footprints
-from whill_mjx.world.maps.grid import GridMap
+from whill_mjx.world.maps.grid import FARTHEST, GridMap
 from whill_mjx.world.maps.made import made_plan
 from whill_mjx.world.maps.nav2 import load_map
 from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
@@ -45,8 +45,12 @@ def read_map(path: str | Path, cell: float = 0.1, scale: float = 1.0) -> GridMap
     """Occupancy grid of a map of any known kind, by the ending of its name.
 
     "made:7" is the floor plan of seed 7. Footprints, point clouds and meshes get cells of `cell` [m]; `scale` is metres
-    per unit of the last two.
+    per unit of the last two. A map that lies far from its zero is moved there (`GridMap.shift`).
     """
+    return _read(path, cell, scale).brought_near()
+
+
+def _read(path: str | Path, cell: float, scale: float) -> GridMap:
     made, _, seed = str(path).partition("made:")
     if not made and seed.isdecimal():
         return made_plan(int(seed))
@@ -66,14 +70,18 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN,
 
     Args:
         grid: from `load_map` or `load_footprints`.
-        reach: what the vehicle needs.
+        reach: what the vehicle needs (`reach_of`); None takes a WHILL Model CR.
         keep: walls that an image shows at most.
         seed: of the places.
 
     Raises:
-        ValueError: no place is wide enough, or no two are the asked distance apart.
+        ValueError: it reaches too far from zero, no place is wide enough, or no two are the asked distance apart.
     """
     reach = reach or Reach()
+    if (far := grid.farthest()) > FARTHEST:
+        raise ValueError(f"the map's corners lie {far:.0f} m from zero; poses are in single precision, so a map may "
+                         f"reach {FARTHEST:g} m. Cut it into smaller ones"
+                         f"{', or take grid.brought_near()' if grid.brought_near().farthest() <= FARTHEST else ''}.")
     space = open_space(grid)
     clear = clearances(space, grid.resolution)
     space = connected(space, clear >= reach.passing)
@@ -83,7 +91,7 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN,
             f"{reach.passing:g} m. Check the resolution and the thresholds."
         )
     places = draw_places(grid, space, reach, seed=seed)
-    return MapScene(grid, space, map_walls(straight_walls(grid, space), keep), places)
+    return MapScene(grid, space, map_walls(straight_walls(grid, space), keep, near=reach.near), places)
 
 
 def map_scene_sampler(made: Any) -> Callable[[jax.Array], tuple[Scene, jax.Array]]:

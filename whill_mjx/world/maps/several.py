@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from whill_mjx.world.maps.grid import FARTHEST
 from whill_mjx.world.maps.places import Places
 from whill_mjx.world.maps.playable import MapScene
 from whill_mjx.world.maps.walls import map_walls
@@ -42,20 +43,36 @@ class MapGroup:
 
 
 def side_by_side(scenes: Sequence[MapScene]) -> MapGroup:
-    """A group of at least one map; a single one stays as it is."""
+    """A group of at least one map in a row along x; a single one stays as it is.
+
+    Raises:
+        ValueError: the row is too long.
+    """
     first = scenes[0]
     if len(scenes) == 1:
         return MapGroup((first,), np.zeros((1, 2)), first.walls, first.places)
-    shifts, end = [np.zeros(2)], first.walls.segments[..., 0].max()
+    low, high = _span(first)
+    shifts = [np.zeros(2)]
     for scene in scenes[1:]:
-        shifts.append(np.array([end + GAP - scene.walls.segments[..., 0].min(), 0.0]))
-        end = scene.walls.segments[..., 0].max() + shifts[-1][0]
+        own_low, own_high = _span(scene)
+        beside = own_low[1] <= high[1] and low[1] <= own_high[1]
+        shifts.append(np.array([high[0] + GAP - own_low[0], 0.0 if beside else low[1] - own_low[1]]))
+        low, high = np.minimum(low, own_low + shifts[-1]), np.maximum(high, own_high + shifts[-1])
+    if (far := float(np.abs([low, high]).max())) > FARTHEST:
+        raise ValueError(f"{len(scenes)} maps side by side reach {far:.0f} m from zero; poses are in single precision, "
+                         f"so they may reach {FARTHEST:g} m. Name fewer maps.")
     pairs = list(zip(scenes, shifts, strict=True))
     walls = map_walls(np.concatenate([one.walls.segments + shift for one, shift in pairs]), first.walls.keep,
-                      first.walls.height)  # fmt: skip
+                      first.walls.height, max(one.walls.within for one in scenes))  # fmt: skip
     places = Places(
         start=np.concatenate([one.places.start + np.append(shift, 0.0) for one, shift in pairs]),
         goal=np.concatenate([one.places.goal + shift for one, shift in pairs]),
         way=np.concatenate([one.places.way for one in scenes]),
     )
     return MapGroup(tuple(scenes), np.stack(shifts), walls, places)
+
+
+def _span(scene: MapScene) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest x, y [m] of a map's walls."""
+    points = scene.walls.segments.reshape(-1, 2)
+    return points.min(0), points.max(0)

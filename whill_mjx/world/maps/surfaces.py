@@ -23,8 +23,8 @@ LEVEL = 0.05
 """Edge of a bin of heights, when the floor is sought [m]."""
 FLAT = 0.9
 """Least upward part of a face's normal that makes it a floor."""
-SLICES = 0.1
-"""Distance of the planes that cut a mesh [m]."""
+TOUCH = 1e-3
+"""What reaches less far into that band does not count: heights of a file are rounded [m]."""
 HOLE = 0.5
 """Gaps of the floor that are closed: lines of a scanner lie so far apart [m]."""
 MARGIN = 0.5
@@ -34,7 +34,7 @@ TYPES = {("F", 4): "f4", ("F", 8): "f8", ("U", 1): "u1", ("U", 2): "u2", ("U", 4
 
 
 def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0) -> GridMap:
-    """Occupancy grid of a point cloud or a mesh.
+    """Occupancy grid of a point cloud or a mesh; one that lies far from zero is moved there (`GridMap.shift`).
 
     Args:
         path: file; its ending says of which kind.
@@ -42,7 +42,7 @@ def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0)
         scale: metres per unit of the file.
 
     Raises:
-        ValueError: no such file, another kind of content, too large, or no floor in it; names file and remedy.
+        ValueError: no such file, another kind of content, damaged, too large, or no floor in it; names file and remedy.
     """
     path = Path(path)
     try:
@@ -79,7 +79,7 @@ def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0)
     cells = np.full((rows, columns), UNKNOWN, np.uint8)
     cells[floor] = FREE
     cells[solid] = OCCUPIED
-    return GridMap(cells, resolution, (float(low[0]), float(low[1]), 0.0))
+    return GridMap(cells, resolution, (float(low[0]), float(low[1]), 0.0)).brought_near()
 
 
 def _npy(data: bytes) -> tuple[np.ndarray, None]:
@@ -99,15 +99,28 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
         loaded: Any = trimesh.load(path, process=False)
     else:
         loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False)
-    if isinstance(loaded, trimesh.Scene):
-        loaded = loaded.to_mesh() if loaded.geometry else None
-    if loaded is None:
+    parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
+    if not parts:
         raise ValueError("there is no geometry in it")
+    for part in parts:  # before they become one mesh, in which a wrong corner may be another part's
+        _check_corners(np.shape(part.vertices), getattr(part, "faces", None))
+    if isinstance(loaded, trimesh.Scene):
+        loaded = loaded.to_mesh()
     points = np.asarray(loaded.vertices, float)
     if kind in ("glb", "gltf"):  # y is up
         points = points[:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
     faces = getattr(loaded, "faces", None)
     return points, None if faces is None or not len(faces) else np.asarray(faces)
+
+
+def _check_corners(shape: tuple[int, ...], faces: Any) -> None:
+    """ValueError where corners of this shape are no (N, 3), or a face (F, 3) names one that is not there."""
+    if shape[1:] != (3,):
+        raise ValueError(f"corners of shape {shape}; (N, 3) numbers are needed")
+    corners = np.zeros(0, int) if faces is None else np.asarray(faces)
+    wrong = corners[(corners < 0) | (corners >= shape[0])]
+    if len(wrong):
+        raise ValueError(f"a face has the corner {int(wrong[0])}, and the corners are 0 to {shape[0] - 1}")
 
 
 def _pcd(data: bytes) -> tuple[np.ndarray, None]:
@@ -196,9 +209,6 @@ def _of_mesh(
     points: np.ndarray, faces: np.ndarray, low: np.ndarray, shape: Any, resolution: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cells (rows, columns) that are floor, and those in which something stands."""
-    import cv2
-    import trimesh
-
     corners = points[faces]  # (F, 3, 3)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1) / 2
@@ -208,27 +218,51 @@ def _of_mesh(
         return floor > 0, solid > 0
     level = _most_common(corners[up, :, 2].mean(1), area[up])
     ground = corners[up & (np.abs(corners[:, :, 2].mean(1) - level) <= STEP)]
-    for triangle in np.rint(((ground[:, :, :2] - low) / resolution - 0.5) * 256).astype(np.int32):
-        cv2.fillConvexPoly(floor, triangle, 1, shift=8)
-    heights = np.arange(STEP + SLICES / 2, HEADROOM, SLICES)
-    mesh = trimesh.Trimesh(points, faces, process=False)
-    cuts = trimesh.intersections.mesh_multiplane(mesh, [0.0, 0.0, level], [0.0, 0.0, 1.0], heights)
-    for lines, to_world in zip(cuts[0], cuts[1], strict=True):
-        if not len(lines):
-            continue
-        ends = lines.reshape(-1, 2)
-        ends = (to_world @ np.column_stack([ends, np.zeros(len(ends)), np.ones(len(ends))]).T).T[:, :2]
-        places = np.rint(((ends.reshape(-1, 2, 2) - low) / resolution - 0.5) * 256).astype(np.int32)
-        cv2.polylines(solid, list(places), False, 1, shift=8)
+    _fill(floor, ground[:, :, :2], low, resolution)
+    _fill(solid, _between(corners, level + STEP + TOUCH, level + HEADROOM - TOUCH), low, resolution)
     return floor > 0, solid > 0
+
+
+def _between(corners: np.ndarray, lower: float, upper: float) -> np.ndarray:
+    """What two levels leave of triangles (F, 3, 3), from above: convex polygons (K, 6, 2) [m] with corners in order.
+
+    Each edge gives both ends of what is left of it; an edge of which nothing is left repeats the corner before.
+    """
+    corners = corners[(corners[..., 2].max(1) >= lower) & (corners[..., 2].min(1) <= upper)]
+    ends = np.roll(corners, -1, 1)
+    start, rise = corners[..., 2], ends[..., 2] - corners[..., 2]
+    level = np.abs(rise) < 1e-12
+    shares = [np.where(level, 0.0, (height - start) / np.where(level, 1.0, rise)) for height in (lower, upper)]
+    inside = (start >= lower) & (start <= upper)
+    first = np.where(level, 0.0, np.clip(np.minimum(*shares), 0.0, None))
+    last = np.where(level, inside, np.clip(np.maximum(*shares), None, 1.0))
+    left = (first <= last) & (inside | ~level)  # (K, 3)
+    way = (ends - corners)[..., :2]
+    points = np.stack([corners[..., :2] + share[..., None] * way for share in (first, last)], 2)  # (K, 3, 2, 2)
+    for edge in (0, 1, 2, 0, 1):
+        points[:, edge] = np.where(left[:, edge, None, None], points[:, edge], points[:, edge - 1, 1:])
+    return points[left.any(1)].reshape(-1, 6, 2)
+
+
+def _fill(cells: np.ndarray, polygons: np.ndarray, low: np.ndarray, resolution: float) -> None:
+    """Set the cells that convex polygons (K, N, 2) [m] cover or cross."""
+    import cv2
+
+    for polygon in np.rint(((polygons - low) / resolution - 0.5) * 256).astype(np.int32):
+        cv2.fillConvexPoly(cells, polygon, 1, shift=8)
 
 
 def _most_common(height: np.ndarray, weight: np.ndarray) -> float:
     """The lowest height [m] at which at least half as much lies as at the commonest one: ceilings are above."""
-    lowest = height.min()
-    index = ((height - lowest) / LEVEL).astype(int)
+    bins, index = np.unique(np.floor(height / LEVEL), return_inverse=True)  # few, however far apart they lie
     amount = np.bincount(index, weight)
-    both = amount + np.append(amount[1:], 0.0)  # a floor may lie on the border of two bins
-    first = int(np.argmax(both >= 0.5 * both.max()))
-    chosen = (index == first) | (index == first + 1)
+    pairs = np.union1d(bins, bins - 1)  # a floor may lie on the border of two bins
+
+    def amount_in(wanted: np.ndarray) -> np.ndarray:
+        place = np.searchsorted(bins, wanted).clip(max=len(bins) - 1)
+        return np.where(bins[place] == wanted, amount[place], 0.0)
+
+    both = amount_in(pairs) + amount_in(pairs + 1)
+    first = pairs[np.argmax(both >= 0.5 * both.max())]
+    chosen = np.isin(bins[index], (first, first + 1))
     return float(np.average(height[chosen], weights=weight[chosen]))

@@ -25,7 +25,8 @@ UNROLL = 16
 SHOWN = 40
 """Walls that an image shows at most: in four real maps, 0.05 % of the columns of 64 see others."""
 SQUARE, NEAR = 0.5, 1.2
-"""Edge of the squares that have lists of their walls, and how near a wall has to be: a wheelchair and a step [m]."""
+"""Edge of the squares that have lists of their walls, and how near a wall has to be for a wheelchair [m]; for other
+vehicles `whill_mjx.world.maps.places.reach_of` says it."""
 THICKNESS = 0.002
 """Depth of a drawn wall, behind its face [m]."""
 
@@ -194,20 +195,20 @@ def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: In
     return dataclasses.replace(scene, boxes=boxes)
 
 
-def map_walls(segments: np.ndarray, keep: int = SHOWN, height: float = 2.2) -> MapWalls:
+def map_walls(segments: np.ndarray, keep: int = SHOWN, height: float = 2.2, near: float = NEAR) -> MapWalls:
     """Walls (S, 2, 2) [m] of a map, of which an image shows `keep` at most, with the lists of those within reach.
 
-    A list holds every wall within `NEAR` of any place in its square; the lists are as long as the longest of them.
+    A list holds every wall within `near` [m] of any place in its square; the lists are as long as the longest of them.
     """
     segments = np.asarray(segments, np.float32)
-    low = segments.reshape(-1, 2).min(0) - NEAR
-    columns, rows = np.ceil((segments.reshape(-1, 2).max(0) + NEAR - low) / SQUARE).astype(int)
+    low = segments.reshape(-1, 2).min(0) - near
+    columns, rows = np.ceil((segments.reshape(-1, 2).max(0) + near - low) / SQUARE).astype(int)
     lists: list[list[int]] = [[] for _ in range(rows * columns)]
     corner = SQUARE * np.array([[0.5, 0.5]])
-    reach = NEAR + SQUARE * 0.5**0.5
+    reach = near + SQUARE * 0.5**0.5
     for number, (start, end) in enumerate(segments.astype(float)):
-        first = np.maximum(np.floor((np.minimum(start, end) - low - NEAR) / SQUARE).astype(int), 0)
-        last = np.minimum(np.floor((np.maximum(start, end) - low + NEAR) / SQUARE).astype(int), [columns - 1, rows - 1])
+        first = np.maximum(np.floor((np.minimum(start, end) - low - near) / SQUARE).astype(int), 0)
+        last = np.minimum(np.floor((np.maximum(start, end) - low + near) / SQUARE).astype(int), [columns - 1, rows - 1])
         spans = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
         column, row = (axis.ravel() for axis in np.meshgrid(*spans))
         centre = low + np.column_stack([column, row]) * SQUARE + corner
@@ -216,7 +217,8 @@ def map_walls(segments: np.ndarray, keep: int = SHOWN, height: float = 2.2) -> M
         close = np.hypot(*(start + share[:, None] * way - centre).T) <= reach
         for place in (row * columns + column)[close]:
             lists[place].append(number)
-    near = np.full((len(lists), max(map(len, lists))), -1, np.int32)
-    for place, numbers in enumerate(lists):
-        near[place, : len(numbers)] = numbers
-    return MapWalls(segments, keep, height, near, (float(low[0]), float(low[1])), SQUARE, (int(rows), int(columns)))
+    listed = np.full((len(lists), max(map(len, lists))), -1, np.int32)
+    for number, numbers in enumerate(lists):
+        listed[number, : len(numbers)] = numbers
+    lowest, shape = (float(low[0]), float(low[1])), (int(rows), int(columns))
+    return MapWalls(segments, keep, height, listed, lowest, SQUARE, shape, near)
