@@ -152,15 +152,15 @@ def test_shaping_changes_the_learners_reward_and_not_the_evaluations():
         truncated: object
         metrics: object
 
-    commands = jnp.zeros((2, 2))
+    commands, scene = jnp.zeros((2, 2)), SimpleNamespace(people=None)
 
     def step(state, action):
-        return SimpleNamespace(env=SimpleNamespace(command=action)), Step(**vars(told))
+        return SimpleNamespace(env=SimpleNamespace(command=action, scene=scene)), Step(**vars(told))
 
     batch = SimpleNamespace(count=2, step=step, env=SimpleNamespace(
         task=task, height=8, width=8, model=SimpleNamespace(config=SimpleNamespace(control_dt=0.1)),
         repaints=False, sensors=()))
-    state, action = SimpleNamespace(env=SimpleNamespace(command=commands)), jnp.ones((2, 2))
+    state, action = SimpleNamespace(env=SimpleNamespace(command=commands, scene=scene)), jnp.ones((2, 2))
     new, shaped = functional_env(batch, SAFETY["safe"]).step(state, action)
     np.testing.assert_allclose(new.env.command, [[0.1, 0.2]] * 2, atol=1e-6)  # 1 m/s^2 and 2 rad/s^2 for 0.1 s
     np.testing.assert_allclose(shaped.reward, [1 - 40 * 0.1 * 0.2 - 0.2 * 0.3, 1.0], atol=1e-6)
