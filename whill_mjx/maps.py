@@ -31,7 +31,7 @@ class Import:
     cell: Annotated[float, Range(0.02, 1.0)] = 0.1
     """Edge of a cell of footprints, point clouds and meshes [m]."""
     scale: Annotated[float, Range(1e-6, 1e3)] = 1.0
-    """Metres per unit of a point cloud or a mesh; 0.001 for millimetres."""
+    """Metres per unit of a point cloud, a mesh or projected CityGML; 0.001 for millimetres, 0.3048 for feet."""
     width: Annotated[float, POSITIVE] = 0.9
     """Narrowest passage that the vehicle uses [m]."""
     pixels: Annotated[int, Range(100, 8000)] = 1200
@@ -55,6 +55,8 @@ def main(options: Import) -> None:
     if grid.shift != (0.0, 0.0):
         print("moved to zero: add {:.0f}, {:.0f} m to x, y of the scene for those of the file".format(*grid.shift))
     print(f"free and within reach: {made.space.sum() * grid.resolution**2:.0f} m2")
+    for note in grid.notes:
+        print(note)
     print(f"walls: {len(made.walls.segments)} straight ones, from {steps} edges of cells")
     print(f"starts and goals: {len(places.way)} pairs, {places.way.min():.1f} to {places.way.max():.1f} m apart")
     import io

@@ -213,7 +213,7 @@ def test_footprints_have_their_size_in_metres(tmp_path):
     path.write_text(GML)
     grid = load_footprints(path)
     assert (grid.cells == OCCUPIED).sum() * 0.01 == pytest.approx(20.0**2 - 10.0**2, rel=0.02)
-    assert grid.origin[:2] == (-10.0, -10.0)
+    assert grid.origin[:2] == (-20.0, -20.0)  # the middle of the yard and the free ground around it
 
 
 @pytest.mark.parametrize(("text", "message"), [

@@ -3,6 +3,9 @@
 images      image files as grey levels
 nav2        nav2's YAML and image as an occupancy grid, by nav2's rule
 footprints  buildings of OpenStreetMap and CityGML as an occupancy grid
+osm         outlines of buildings of OpenStreetMap
+citygml     outlines of buildings and street furniture of CityGML
+coordinates coordinate systems of both, and their places in metres
 surfaces    point clouds and meshes as an occupancy grid
 grid        occupancy grid, borders of the free space
 straight    long straight walls from the borders of cells

@@ -32,6 +32,8 @@ class GridMap:
     """(rows, columns) int8: the values of nav2's OccupancyGrid, 0 to 100 and -1 for unknown; None of made grids."""
     shift: tuple[float, float] = (0.0, 0.0)
     """Whole metres x, y that were taken off the file's coordinates; added to a place, they give the file's own."""
+    notes: tuple[str, ...] = ()
+    """How the file's coordinates were understood, and what of it is left out."""
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         """World coordinates (..., 2) of points (..., 2) in the grid's own frame [m]."""

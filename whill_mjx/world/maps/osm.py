@@ -1,0 +1,118 @@
+"""Outlines of the buildings of OpenStreetMap XML: closed ways, and relations of ways."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+
+from whill_mjx.world.maps.coordinates import read_numbers, unreadable
+
+OUTER = ("outer", "outline", "")
+"""Roles of the ways around a building. `inner` are its courtyards; others, such as `part`, are no border of it."""
+Place = tuple[float, float]
+
+
+def read_osm(root: ET.Element) -> tuple[list[list[np.ndarray]], list[str]]:
+    """Rings (n, 2) of latitude and longitude of every building, the outer one first, and notes on what is left out."""
+    places = {
+        node.get("id"): _place(node)
+        for node in root.iter("node")
+        if node.get("visible") != "false" and node.get("lat")
+    }
+    ways = {
+        way.get("id"): [place for one in way.iter("nd") if (place := places.get(one.get("ref")))]
+        for way in root.iter("way")
+        if way.get("visible") != "false"
+    }
+    chosen: list[list[np.ndarray]] = []
+    cut: list[str] = []
+    for way in root.iter("way"):
+        ring = ways.get(way.get("id"), [])
+        if _is_building(way) and _is_closed(ring):
+            chosen.append([np.array(ring)])
+        elif _is_building(way):
+            cut.append(f"way {way.get('id')}")
+    for relation in root.iter("relation"):
+        if _is_building(relation):
+            outlines, whole = _outlines(relation, ways)
+            chosen += outlines
+            if not whole:
+                cut.append(f"relation {relation.get('id')}")
+    shown = ", ".join(cut[:5]) + (f" and {len(cut) - 5} more" if len(cut) > 5 else "")
+    return chosen, [f"borders of buildings that are not whole in the file, left out: {shown}"] if cut else []
+
+
+def _place(node: ET.Element) -> Place:
+    numbers = read_numbers(f"{node.get('lat')} {node.get('lon', 'nan')}")
+    if len(numbers) != 2:
+        raise unreadable(f"node {node.get('id')}")
+    return numbers[0], numbers[1]
+
+
+def _is_building(element: ET.Element) -> bool:
+    tags = {tag.get("k"): tag.get("v") for tag in element.iter("tag")}
+    below = tags.get("location") == "underground" or (tags.get("layer") or "0").startswith("-")
+    return tags.get("building", "no") not in ("no", "roof") and not below
+
+
+def _is_closed(ring: list[Place]) -> bool:
+    return len(ring) > 3 and ring[0] == ring[-1]
+
+
+def _outlines(relation: ET.Element, ways: dict[str | None, list[Place]]) -> tuple[list[list[np.ndarray]], bool]:
+    """Outer rings of a relation, each with its courtyards, and whether no piece of an outer ring was left over."""
+    roles = {one.get("ref"): one.get("role", "") for one in relation.iter("member") if one.get("type") == "way"}
+    outer, whole = _joined([ways.get(ref, []) for ref, role in roles.items() if role in OUTER])
+    inner, _ = _joined([ways.get(ref, []) for ref, role in roles.items() if role == "inner"])
+    outlines = [[ring] for ring in sorted(outer, key=_area)]
+    for ring in inner:  # of the smallest outer ring around it; without such a ring it is nothing
+        point, area = _inner_point(ring), _area(ring)
+        around = (one for one in outlines if _area(one[0]) > area and _is_within(point, one[0]))
+        next(around, []).append(ring)
+    return outlines, whole
+
+
+def _joined(parts: list[list[Place]]) -> tuple[list[np.ndarray], bool]:
+    """Closed rings (n, 2) of pieces that meet at their ends, and whether no piece is missing or left over."""
+    rings, whole, parts = [], all(len(part) > 1 for part in parts), [list(part) for part in parts if len(part) > 1]
+    while parts:
+        ring = parts.pop()
+        while ring[0] != ring[-1]:
+            for index, part in enumerate(parts):
+                if ring[-1] in (part[0], part[-1]):
+                    part = parts.pop(index)
+                    ring += (part if part[0] == ring[-1] else part[::-1])[1:]
+                    break
+            else:
+                break
+        if _is_closed(ring):
+            rings.append(np.array(ring))
+        else:
+            whole = False
+    return rings, whole
+
+
+def _area(ring: np.ndarray) -> float:
+    x, y = (ring - ring[0]).T
+    return abs(float(x[:-1] @ y[1:] - x[1:] @ y[:-1])) / 2
+
+
+def _crossings(ring: np.ndarray, height: float) -> np.ndarray:
+    """Sorted first coordinates at which a ring crosses a second coordinate."""
+    a, b = ring[:-1], ring[1:]
+    met = (a[:, 1] > height) != (b[:, 1] > height)
+    a, b = a[met], b[met]
+    return np.sort(a[:, 0] + (height - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0]))
+
+
+def _inner_point(ring: np.ndarray) -> tuple[float, float]:
+    """A point inside of a ring, off its border: a corner may lie on the ring around it."""
+    heights = np.unique(ring[:, 1])
+    height = float(heights[:2].mean())
+    met = _crossings(ring, height)
+    return (float(met[:2].mean()) if len(met) else float(ring[0, 0])), height
+
+
+def _is_within(point: tuple[float, float], ring: np.ndarray) -> bool:
+    return int((_crossings(ring, point[1]) > point[0]).sum()) % 2 == 1
