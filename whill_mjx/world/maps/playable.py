@@ -45,7 +45,8 @@ def read_map(path: str | Path, cell: float = 0.1, scale: float = 1.0) -> GridMap
     """Occupancy grid of a map of any known kind, by the ending of its name.
 
     "made:7" is the floor plan of seed 7. Footprints, point clouds and meshes get cells of `cell` [m]; `scale` is metres
-    per unit of the last two. A map that lies far from its zero is moved there (`GridMap.shift`).
+    per unit of point clouds, meshes and projected CityGML. A map that lies far from its zero is moved there
+    (`GridMap.shift`).
     """
     return _read(path, cell, scale).brought_near()
 
@@ -58,7 +59,7 @@ def _read(path: str | Path, cell: float, scale: float) -> GridMap:
     if ending in (*CLOUDS, *MESHES):
         return load_surfaces(path, cell, scale)
     if ending in (".osm", ".gml", ".xml"):
-        return load_footprints(path, cell)
+        return load_footprints(path, cell, scale)
     if ending in (".yaml", ".yml"):
         return load_map(path)
     raise ValueError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml, "
