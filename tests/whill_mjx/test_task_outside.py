@@ -6,7 +6,7 @@ import json
 import re
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,6 +25,7 @@ from whill_mjx.tasks.base import Budget, Task
 from whill_mjx.tasks.corridor import Corridor
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import TASKS, find_task, make_task, register_task, source_of, unregister_task
+from whill_mjx.world import solids
 
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 LINES = 60
@@ -242,6 +243,37 @@ class Slalom(Corridor):
     """Another task's child, with neither name nor budget of its own."""
 
     poles: tuple[float, ...] = (1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Polite(Corridor):
+    """Another task's child that looks at its people, with a post of its own where it is wanted."""
+
+    post: bool = False
+
+    def sample_world(self, key):
+        world = super().sample_world(key)
+        rounds = solids.stack_rounds([solids.post(1.0, 0.5, 1.0, 0.1, (0.2, 0.2, 0.2))])
+        own = solids.Solids(rounds=rounds) if self.post else None
+        return replace(world, scene=replace(world.scene, solids=own))
+
+    def rewards(self, moment):
+        return {**super().rewards(moment), "held": -moment.scene.people.held.sum().astype(float)}
+
+
+@pytest.mark.quick
+def test_rewards_may_look_at_the_people_of_a_task_that_has_some():
+    env, params = make_env(Polite(people=2))
+    assert reset_state(env, params, jax.random.key(0)).scene.people.speed.shape == (2,)
+    with pytest.raises(ValueError, match="rewards, line .*: AttributeError"):
+        make_env(Polite())
+
+
+@pytest.mark.quick
+def test_furnished_rooms_do_not_swallow_the_posts_of_a_task():
+    with pytest.raises(ValueError, match="looks are rich, and the task has solids of its own"):
+        env, params = make_env(Polite(people=2, post=True), looks="rich")
+        jax.eval_shape(lambda key: reset_state(env, params, key), jax.random.key(0))
 
 
 @pytest.mark.quick

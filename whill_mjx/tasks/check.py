@@ -7,6 +7,7 @@ import inspect
 import re
 import traceback
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from types import FunctionType
 from typing import Any
@@ -19,6 +20,7 @@ from whill_mjx.sensors.base import as_sensors
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.base import Budget, Task, World
 from whill_mjx.tasks.terms import Moment
+from whill_mjx.world.people.contact import scene_with_people
 from whill_mjx.world.scene import Footprint
 
 METHODS = ("sample_world", "goal", "rewards", "endings", "observations")
@@ -45,6 +47,8 @@ def check_task(task: Task) -> None:
         raise _wrong(task, "sample_world", f"returns {type(world).__name__}", "a World(scene, start)")
     if jnp.shape(world.start) != (3,):
         raise _wrong(task, "sample_world", f"start has shape {jnp.shape(world.start)}", "(3,): x, y [m], yaw [rad]")
+    if task.people:
+        world = _peopled(task, world)
     goal = _traced(task, "goal", world.scene)
     if getattr(goal, "shape", None) != (2,):
         raise _wrong(task, "goal", f"returns {_named(goal)}", "an array (2,): x, y [m]")
@@ -162,6 +166,19 @@ def _abstract(shape: tuple[int, ...], dtype: Any) -> Any:
     if dtype is jax.dtypes.prng_key:
         return jax.eval_shape(jax.random.key, 0)
     return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def _peopled(task: Task, world: World) -> World:
+    """The world with its people, as shapes."""
+    key = _abstract((), jax.dtypes.prng_key)
+
+    def fill(key: jax.Array, world: World) -> World:
+        return replace(world, scene=scene_with_people(world.scene, task.populate(key, world), key))
+
+    try:
+        return jax.eval_shape(fill, key, world)
+    except (Exception, SystemExit) as error:
+        raise _failed(task, "populate", error) from error
 
 
 def _moment(world: World) -> Moment:

@@ -128,7 +128,13 @@ def furnish(key: jax.Array, scene: Scene, lone: bool) -> Scene:
         scene: a lane: left, right and far wall, then obstacles.
         lone: whether there is one obstacle, which gets another size and turn. Things stand beside it where PASSAGE is
             left; next to several obstacles nothing is put.
+
+    Raises:
+        ValueError: the scene has solids of its own.
     """
+    if jax.tree.leaves(scene.solids):
+        raise ValueError("looks are rich, and the task has solids of its own (posts, rods or blocks): furnished rooms "
+                         "have boxes only. Make them boxes, or take the looks plain or paper.")
     draw, room = Draws(key, 220), room_of(scene)
     covered, low = draw.chance(0.85), draw(1.0, 2.4)
     ceiling = draw(2.3, 3.2)
