@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,21 @@ from sysid.logs.bags.reader import read_bag
 from sysid.logs.bags.recording import PACKED, Bag, find_bags
 from sysid.logs.conversion_options import ConvertConfig
 from sysid.logs.coverage import sanity
-from sysid.logs.dataset_writing import write_dataset
+from sysid.logs.dataset_writing import HEADERS, Found, write_dataset
 from sysid.logs.drive_cuts import SHORTEST, Drive, Source, at_axle, cut_drives, trial_drive
-from sysid.logs.log import load_log
-from sysid.logs.measured import is_known, load_whole
+from sysid.logs.log import load_log, read_csv, read_fields, spec_from_fields
+from sysid.logs.measured import detect_format, is_known, load_whole
 from sysid.logs.records import Log
 from sysid.logs.sources import is_lerobot
 from sysid.logs.tables.drives import TextDrive, join_drives, read_drives
 from sysid.logs.tables.text_table import text_files
 from whill_mjx.io.fields import COLUMNS, counted
-from whill_mjx.vehicle.specs import SPECS, VehicleSpec, find_spec
+from whill_mjx.vehicle.specs import SPECS, WHILL_CR, VehicleSpec, find_spec, in_proportion
 
 OF_RECORDINGS = ("vehicle", "wheel_radius", "track", "mass", "command_topic", "odometry_topic", "truth_topic",
                  "imu_topic", "input", "stamp", "split")  # options that are for bags and tables
+OF_VEHICLE = ("schema", "vehicle", "drive", "driven_axle", "wheel_radius", "track", "wheelbase", "mass",
+              "command_limits", "held_out")  # fields of dataset.toml that follow from a vehicle and its trials
 
 
 def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
@@ -39,51 +41,90 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
                                 "set.")
     if config.out.exists() and config.out.samefile(config.source):
         raise ValueError(f"--out {config.out}: exists already, and is the source. Choose another --out.")
+    there = _vehicle_there(config)
     bags = find_bags(config.source)
-    notes: list[str] = []
-    more: dict[str, Any] = {} if config.command_timeout is None else {"command_timeout": config.command_timeout}
-    held_out = config.held_out
     if is_lerobot(config.source) or not bags and not is_known(config.source) and text_files(config.source):
-        spec, drives, notes, fields, held = _table_drives(config)
-        more |= fields
-        held_out = held_out or (() if (config.out / "dataset.toml").exists() else held)
+        found = _of_tables(config, there)
     elif bags:
-        spec = _spec(config)
-        drives, notes, wheels = _any_drives(bags, config, spec)
-        notes += _tables_beside(config.source)
-        if wheels:
-            more["input"] = "wheels"
+        found = _of_bags(bags, config, there)
     else:
-        spec, drives, notes = _known_drives(config)
+        found = _of_known(config)
+    drives = found.drives
     if not drives:
         raise ValueError(f"{config.source}: no drive in it moves for {SHORTEST:g} s. Check --command-topic, or use "
                          "--split bag.")
-    unknown = sorted(set(held_out) - {drive.name for drive in drives})
+    unknown = sorted(set(config.held_out) - {drive.name for drive in drives})
     if unknown:
         raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
                          f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
-    notes += write_dataset(config.out, spec, drives, held_out, more, config.source)
+    if config.command_timeout is not None:
+        found = replace(found, more={**found.more, "command_timeout": config.command_timeout})
+    held_out = config.held_out or (found.held_out if there is None else ())
+    notes = [*found.notes, *write_dataset(config.out, found, held_out, config.source)]
     log = load_log(config.out)
+    if fitted := sorted(set(found.held_out) - {trial.name for trial in log.held_out}) if there is not None else []:
+        notes.append(f"{', '.join(fitted)}: held out in {config.source}, but not here. Add "
+                     f"{'it' if len(fitted) == 1 else 'them'} to held_out of {config.out / 'dataset.toml'}")
     made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
 
 
-def _known_drives(config: ConvertConfig) -> tuple[VehicleSpec, list[Drive], list[str]]:
-    """The vehicle and the trials of a dataset or a measured set, and notes."""
+def _vehicle_there(config: ConvertConfig) -> VehicleSpec | None:
+    """The vehicle of a dataset that trials are added to; None where --out is new.
+
+    ValueError where an option says something else: its dataset.toml stays as it is.
+    """
+    path = config.out / "dataset.toml"
+    if not path.exists():
+        return None
+    fields = read_fields(path)
+    spec, _ = spec_from_fields(path, fields)
+    has = {"vehicle": spec.name, "wheel_radius": spec.wheel_radius, "track": spec.track, "mass": spec.mass,
+           "command_timeout": fields.get("command_timeout", "not stated")}
+    for key, mine in has.items():
+        asked = getattr(config, key)
+        if asked in (getattr(ConvertConfig, key), mine):
+            continue
+        flag = f"--{key.replace('_', '-')}"
+        correct = f" correct {key} there," if key in ("mass", "command_timeout") else ""  # nothing was computed with it
+        raise ValueError(f"{path}: {key} is {mine}, and {flag} {asked} differs. Leave {flag} out,{correct} or choose "
+                         "another --out.")
+    return spec
+
+
+def _of_known(config: ConvertConfig) -> Found:
+    """What a dataset or a measured set holds."""
     if config.columns:
         raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
     if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
         raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
                          "Leave it out.")
     log = load_whole(config.source, config.select)
-    drives = [trial_drive(trial) for trial in log.trials]
+    names, notes = [trial.name for trial in log.trials], list(log.notes)
+    of_dataset = detect_format(config.source) == "dataset"
+    folders = {name: config.source / "trials" / name for name in names} if of_dataset else {}
+    drives = [_written(one) for one in folders.values()] or [trial_drive(trial) for trial in log.trials]
     drives = [one if one.ground_truth is None else replace(one, ground_truth=at_axle(one.ground_truth, config))
               for one in drives]
-    notes = list(log.notes)
     if any(trial.odometry is not None and trial.odometry.x is None for trial in log.trials):
         notes.append("the pose of the odometry was not logged: it is dead reckoned from the wheel speeds")
-    return log.spec, drives, notes
+    if not of_dataset:
+        return Found(log.spec, drives, notes)
+    held = [name for name in log.fields.get("held_out", ()) if name in names]
+    more = {key: value for key, value in log.fields.items() if key not in OF_VEHICLE}
+    return Found(log.spec, drives, notes, held, more, log.fields, folders)
+
+
+def _written(folder: Path) -> Drive:
+    """A trial of a dataset as it was written: what its loader makes of a time-out, wheel speeds or a gyro is not in
+    it."""
+    tables: dict[str, Any] = {"odometry": None, "ground_truth": None}
+    for stream, header in HEADERS.items():
+        if (path := folder / f"{stream}.csv").exists():
+            columns = read_csv(path, tuple(header.split(",")))
+            tables[stream] = np.column_stack([columns[name] for name in header.split(",")])
+    return Drive(folder.name, **tables)
 
 
 def _tables_beside(source: Path) -> list[str]:
@@ -93,18 +134,17 @@ def _tables_beside(source: Path) -> list[str]:
             ] if loose else []
 
 
-def _any_drives(
-    bags: Sequence[Path], config: ConvertConfig, spec: VehicleSpec
-) -> tuple[list[Drive], list[str], bool]:
-    """Trials of several bags, notes, and whether their input is measured wheel speeds: where no bag has commands."""
-    wheels = config.input == "wheels"
+def _of_bags(bags: Sequence[Path], config: ConvertConfig, there: VehicleSpec | None) -> Found:
+    """What several bags hold; their input is measured wheel speeds where no bag has commands."""
+    wheels, spec = config.input == "wheels", _spec(config, there)
     drives, notes, refused = _bags_drives(bags, config, spec, wheels)
     if not drives and config.input == "auto" and all("no command topic found" in str(error) for error in refused):
-        drives, more, _ = _bags_drives(bags, config, spec, True)
-        wheels, notes = bool(drives), more if drives else notes
+        drives, said, _ = _bags_drives(bags, config, spec, True)
+        wheels, notes = bool(drives), said if drives else notes
     if not drives and refused:
         raise refused[0]
-    return drives, notes, wheels
+    return Found(spec, drives, [*notes, *_tables_beside(config.source)], more={"input": "wheels"} if wheels else {},
+                 stated=_stated(config))
 
 
 def _bags_drives(
@@ -126,22 +166,22 @@ def _bags_drives(
     return drives, notes, refused
 
 
-def _table_drives(
-    config: ConvertConfig,
-) -> tuple[VehicleSpec, list[Drive], list[str], dict[str, Any], tuple[str, ...]]:
-    """Nominal geometry, trials, notes, fields of dataset.toml and held-out trials of tables or of a LeRobotDataset."""
+def _of_tables(config: ConvertConfig, there: VehicleSpec | None) -> Found:
+    """What tables or a LeRobotDataset hold."""
     said, wheels = config.columns, config.input == "wheels"
     if not is_lerobot(config.source):
-        spec = _spec(config)
+        spec = _spec(config, there)
         found, left = read_drives(config.source, said, (spec.wheel_radius, spec.track), wheels)
         drives, notes, fields = _text_drives(found, config)
-        return spec, drives, [*left, *notes], fields, ()
+        return Found(spec, drives, [*left, *notes], more=fields, stated=_stated(config))
     episodes = lerobot.read(config.source)
-    spec = _spec(config, episodes.spec)
+    noted = episodes.spec if config.vehicle == ConvertConfig.vehicle else None
+    spec = _spec(config, there, noted)
     found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], said,
                               (spec.wheel_radius, spec.track), wheels)
     drives, notes, fields = _text_drives(found, config)
-    return spec, drives, [*episodes.notes, *left, *notes], fields, episodes.held_out
+    return Found(spec, drives, [*episodes.notes, *left, *notes], episodes.held_out, fields,
+                 _stated(config) if noted is None else None)
 
 
 def _text_drives(
@@ -221,19 +261,30 @@ def _recording_name(path: Path) -> str:
     return path.absolute().parent.name if alone else stem
 
 
-def _spec(config: ConvertConfig, noted: VehicleSpec | None = None) -> VehicleSpec:
-    """Nominal geometry: as the options say, else as the source notes it."""
-    changes = {key: value for key in ("wheel_radius", "track", "mass")
-               if (value := getattr(config, key)) is not None}
-    if noted is not None and config.vehicle == ConvertConfig.vehicle:
+def _spec(config: ConvertConfig, there: VehicleSpec | None, noted: VehicleSpec | None = None) -> VehicleSpec:
+    """Nominal geometry: as the source notes it, else of the dataset that trials are added to, else as options say."""
+    changes = _given(config)
+    if noted is not None:
         return replace(noted, **changes)
+    if there is not None:
+        return there
     if config.vehicle in SPECS:
         return replace(find_spec(config.vehicle), **changes)
     missing = [key for key in ("wheel_radius", "track") if key not in changes]
     if missing:
         raise ValueError(f"--vehicle {config.vehicle}: not built in (known: {', '.join(SPECS)}), and no "
                          f"--{missing[0].replace('_', '-')}. Give --wheel-radius and --track as measured.")
-    return replace(find_spec("whill_cr"), name=config.vehicle, **changes)
+    return in_proportion(WHILL_CR, config.vehicle, **changes)
+
+
+def _given(config: ConvertConfig) -> dict[str, float]:
+    """Sizes that options state."""
+    return {key: value for key in ("wheel_radius", "track", "mass") if (value := getattr(config, key)) is not None}
+
+
+def _stated(config: ConvertConfig) -> Container[str] | None:
+    """Fields of the vehicle that are known; None where it is built in, so that all are."""
+    return None if config.vehicle in SPECS else _given(config)
 
 
 def _increasing(t: np.ndarray) -> tuple[np.ndarray, int]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,30 @@ from whill_mjx.logs.dataset import COMMAND_HEADER, IMU_HEADER, ODOMETRY_HEADER, 
 from whill_mjx.vehicle.specs import VehicleSpec
 
 HEADERS = {"command": COMMAND_HEADER, "odometry": ODOMETRY_HEADER, "ground_truth": POSE_HEADER, "imu": IMU_HEADER}
+ENCODER = "encoder.csv"
 
 
-def write_dataset(
-    folder: Path, spec: VehicleSpec, drives: Sequence[Drive], held_out: Sequence[str] = (),
-    more: Mapping[str, Any] | None = None, source: Path | None = None,
-) -> list[str]:
+@dataclass(frozen=True)
+class Found:
+    """What a source holds: the trials to be written, and what dataset.toml says of them."""
+
+    spec: VehicleSpec
+    drives: Sequence[Drive]
+    notes: Sequence[str] = ()
+    held_out: Sequence[str] = ()  # by the source itself
+    more: Mapping[str, Any] = field(default_factory=dict)  # further fields
+    stated: Container[str] | None = None  # fields of the vehicle that are known; None: all
+    beside: Mapping[str, Path] = field(default_factory=dict)  # trial -> its folder, of which encoder.csv is kept
+
+
+def write_dataset(folder: Path, found: Found, held_out: Sequence[str] = (), source: Path | None = None) -> list[str]:
     """Write the trials that the loader accepts into a dataset folder, and note those left out; an existing dataset
-    keeps its fields and trials. `more`: further fields of a new dataset.toml; `source`: named in errors.
+    keeps its fields and trials. `source`: named in errors.
 
-    ValueError, and nothing is written, where a trial exists with other contents, names repeat, or none is accepted.
+    ValueError, and nothing is written, where a trial exists with other contents, names repeat, none is accepted, or an
+    existing dataset is of another vehicle.
     """
+    drives, more = found.drives, dict(found.more)
     names = [drive.name for drive in drives]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -36,11 +50,10 @@ def write_dataset(
     if known and held_out and set(held_out) != set(read_fields(folder / "dataset.toml").get("held_out", ())):
         raise ValueError(f"{folder / 'dataset.toml'}: exists already, so --held-out cannot be noted. Add the "
                          "trials to its held_out by hand.")
+    if known:
+        _check_joins(folder, found)
     if known and any((folder / "trials").glob("*")):
-        log = load_log(folder)  # trials are not added to what cannot be loaded
-        if log.fields.get("input", "commands") != (more or {}).get("input", "commands"):
-            raise ValueError(f"{folder}: its input is {log.fields.get('input', 'commands')}, and that of the new "
-                             "trials is another. Choose another --out.")
+        load_log(folder)  # trials are not added to what cannot be loaded
     made, partial = not folder.exists(), unfinished(folder)
     try:
         accepted, refused = _write_accepted(partial, drives)
@@ -51,10 +64,13 @@ def write_dataset(
             came = f"{source}: made into a trial, " if source else ""
             raise ValueError(f"{came}{reason.removeprefix('left out: ')} Nothing was written.")
         if not known:
-            write_fields(partial, spec, held_out, more)
+            write_fields(partial, found.spec, held_out, more, found.stated)
             spec_from_fields(folder / "dataset.toml", read_fields(partial / "dataset.toml"))
         for name in refused:
             shutil.rmtree(partial / "trials" / name)
+        for name in accepted:
+            if name in found.beside and (encoder := found.beside[name] / ENCODER).exists():
+                shutil.copyfile(encoder, partial / "trials" / name / ENCODER)
         there = [name for name in accepted if (folder / "trials" / name).exists()]
         for name in there:
             if _contents(folder / "trials" / name) != _contents(partial / "trials" / name):
@@ -68,6 +84,20 @@ def write_dataset(
             if made and not any(folder.iterdir()):
                 folder.rmdir()
     return notes
+
+
+def _check_joins(folder: Path, found: Found) -> None:
+    """Raise ValueError where new trials mean something else than those of the dataset that they join."""
+    fields = read_fields(folder / "dataset.toml")
+    spec, _ = spec_from_fields(folder / "dataset.toml", fields)
+    usual = {"input": "commands", "reference_point": "drive axle centre"}
+    pairs = {key: (getattr(spec, key), getattr(found.spec, key)) for key in ("wheel_radius", "track", "drive")}
+    pairs |= {key: (fields.get(key, usual.get(key)), found.more.get(key, usual.get(key)))
+              for key in ("input", *(one for one in ("command_timeout", "reference_point") if one in found.more))}
+    for key, (mine, theirs) in pairs.items():
+        if mine != theirs:
+            raise ValueError(f"{folder}: its {key} is {mine}, and that of the new trials is {theirs}. Choose another "
+                             "--out.")
 
 
 def _place(partial: Path, folder: Path, trials: Sequence[str]) -> None:

@@ -641,3 +641,100 @@ def test_a_gyro_that_cannot_be_used_does_not_cost_the_drive(tmp_path, rate, end)
     write_bag(tmp_path / "circle_1", edit=with_imu(rate, end))
     log, notes = convert(ConvertConfig(tmp_path / "circle_1", tmp_path / "out"))
     assert log.trials[0].gyro is None and any("left out" in note for note in notes)
+
+
+def write_dataset(folder, fields, trials=("wh_1", "wh_2"), encoder=False):
+    """A dataset of `motion`: rows at 10 Hz, with a pause of the commands from 4 to 6 s, and a gyro upside down."""
+    t = np.arange(0.0, 21.0, 0.1)
+    v, omega, x, y, yaw = motion(t)
+    sent = (t < 4.05) | (t > 5.95)
+    streams = {"command": ("t,v,omega", [t[sent], v[sent], omega[sent]]),
+               "odometry": ("t,x,y,yaw,v,omega", [t, x + 3, y, yaw, v, omega]),
+               "ground_truth": ("t,x,y,yaw", [t, x, y, yaw]), "imu": ("t,gyro", [t, -omega])}
+    if encoder:
+        streams["encoder"] = ("t,left,right,counter", [t, 0 * t, 0 * t, 0 * t])
+    for name in trials:
+        (folder / "trials" / name).mkdir(parents=True)
+        for stream, (head, columns) in streams.items():
+            np.savetxt(folder / "trials" / name / f"{stream}.csv", np.column_stack(columns), "%.6f", ",", header=head,
+                       comments="")
+    (folder / "dataset.toml").write_text("schema = 1\n" + "\n".join(fields) + "\n")
+    return folder
+
+
+def numbers(folder, stream):
+    return np.loadtxt(folder / f"{stream}.csv", delimiter=",", skiprows=1)
+
+
+FIELDS = ['vehicle = "small"', "wheel_radius = 0.033", "track = 0.16", 'held_out = ["wh_2"]', "command_timeout = 0.5",
+          'ground_truth = "ceiling cameras"', 'columns = ["time=a/t:s"]', 'reference_point = "vehicle centre"']
+
+
+@pytest.mark.parametrize("more", ['input = "commands"', 'input = "wheels"'])
+def test_a_dataset_that_is_converted_keeps_its_fields_and_its_rows(tmp_path, more):
+    write_dataset(tmp_path / "k1", [*FIELDS, more], encoder=True)
+    before = load_log(tmp_path / "k1")
+    log, _ = convert(ConvertConfig(tmp_path / "k1", tmp_path / "k2", truth_turned=10.0))
+    assert log.fields == before.fields and log.spec == before.spec
+    assert [trial.name for trial in log.held_out] == ["wh_2"]
+    for stream in ("command", "odometry", "imu", "encoder"):
+        old, new = (numbers(tmp_path / name / "trials" / "wh_1", stream) for name in ("k1", "k2"))
+        np.testing.assert_array_equal(old, new)
+    old, new = (numbers(tmp_path / name / "trials" / "wh_1", "ground_truth") for name in ("k1", "k2"))
+    np.testing.assert_allclose(np.angle(np.exp(1j * (new[:, 3] - old[:, 3]))), np.deg2rad(-10.0), atol=1e-5)
+
+
+def test_held_out_trials_of_a_dataset_may_be_stated_anew_and_follow_a_selection(tmp_path):
+    write_dataset(tmp_path / "k1", FIELDS)
+    log, _ = convert(ConvertConfig(tmp_path / "k1", tmp_path / "k2", held_out=("wh_1",)))
+    assert [trial.name for trial in log.held_out] == ["wh_1"]
+    log, _ = convert(ConvertConfig(tmp_path / "k1", tmp_path / "k3", select=("wh_1",)))
+    assert [trial.name for trial in log.trials] == ["wh_1"] and not log.held_out
+    _, notes = convert(ConvertConfig(tmp_path / "k1", tmp_path / "k3"))
+    assert any("wh_2: held out in" in note and "Add it to held_out" in note for note in notes)
+
+
+@pytest.mark.parametrize(("size", "there"), [(None, 52.0 * (0.16 / 0.496) ** 3), (2.5, 2.5)])
+def test_a_robot_that_is_not_built_in_is_in_proportion_and_only_what_was_given_is_stated(bag, tmp_path, size, there):
+    log, _ = convert(ConvertConfig(bag, tmp_path / "log", vehicle="small", wheel_radius=0.033, track=0.16, mass=size))
+    assert log.spec.mass == pytest.approx(there) and log.spec.wheelbase == pytest.approx(0.6 * 0.16 / 0.496)
+    assert ("mass" in log.fields) == (size is not None) and not {"wheelbase", "command_limits"} & set(log.fields)
+    assert any("wheelbase is not in dataset.toml: 0.194 is assumed" in note for note in log.notes)
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    ({"track": 0.5}, r"track is 0.4, and --track 0.5 differs. Leave --track out, or choose another --out"),
+    ({"mass": 7.0}, r"mass is 52.0, and --mass 7.0 differs. Leave --mass out, correct mass there, or choose"),
+    ({"command_timeout": 0.5}, r"command_timeout is not stated, and --command-timeout 0.5 differs"),
+    ({"vehicle": "husky"}, r"vehicle is whill_cr, and --vehicle husky differs"),
+])
+def test_an_option_that_differs_from_the_dataset_that_trials_join_is_refused(bag, tmp_path, options, said):
+    given = {"wheel_radius": 0.1, "track": 0.4}
+    convert(ConvertConfig(bag, tmp_path / "log", **given))
+    shutil.copytree(bag, tmp_path / "figure_2")
+    with pytest.raises(ValueError, match=rf"log/dataset.toml: {said}"):
+        convert(replace(ConvertConfig(tmp_path / "figure_2", tmp_path / "log"), **options))
+    log, _ = convert(ConvertConfig(tmp_path / "figure_2", tmp_path / "log", **given))
+    assert len(log.trials) == 2
+
+
+def test_wheel_speeds_that_join_a_dataset_are_read_with_its_geometry(tmp_path):
+    t = np.arange(0.0, 20.0, 0.05)
+    v, omega, *_ = motion(t)
+    for name in ("w_1", "w_2"):
+        rates = [(v + side * 0.2 * omega) / 0.1 for side in (-1, 1)]
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([t, v, omega, *rates]), "%.6f", ",", comments="",
+                   header="time [s],cmd_v [m/s],cmd_w [rad/s],left_wheel [rad/s],right_wheel [rad/s]")
+    convert(ConvertConfig(tmp_path / "w_1.csv", tmp_path / "log", wheel_radius=0.1, track=0.4))
+    log, _ = convert(ConvertConfig(tmp_path / "w_2.csv", tmp_path / "log"))
+    np.testing.assert_allclose(log.trials[1].odometry.omega, omega, atol=1e-4)
+
+
+def test_trials_of_a_dataset_of_another_vehicle_or_time_out_do_not_join(tmp_path):
+    write_dataset(tmp_path / "a", [one for one in FIELDS if "held_out" not in one], ("wh_1",))
+    for name, changed, said in (("b", FIELDS[1].replace("0.033", "0.1"), "wheel_radius is 0.1"),
+                                ("c", FIELDS[4].replace("0.5", "0.9"), "command_timeout is 0.9")):
+        fields = [changed if one.split(" =")[0] == changed.split(" =")[0] else one for one in FIELDS]
+        write_dataset(tmp_path / name, fields)
+        with pytest.raises(ValueError, match=f"its {said}, and that of the new trials is 0"):
+            convert(ConvertConfig(tmp_path / "a", tmp_path / name))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,21 +78,25 @@ def write_encoder(folder: Path, t: np.ndarray, latency: float, angles: np.ndarra
 
 
 def write_fields(
-    folder: Path, spec: VehicleSpec, held_out: Iterable[str] = (), more: Mapping[str, Any] | None = None
+    folder: Path, spec: VehicleSpec, held_out: Iterable[str] = (), more: Mapping[str, Any] | None = None,
+    stated: Container[str] | None = None,
 ) -> None:
     """Write dataset.toml: the vehicle's nominal geometry, and the trials that are never fitted.
 
     Args:
         more: further fields: numbers, texts or lists of texts.
+        stated: fields of the vehicle that are known; the loader assumes and notes the others. None: all are.
     """
     names = ", ".join(json.dumps(name) for name in held_out)  # a JSON string is a TOML string
+    of_vehicle = {
+        "drive": f'"{spec.drive}"', "driven_axle": f'"{spec.driven_axle}"',
+        **{key: getattr(spec, key) for key in ("wheel_radius", "track", "wheelbase", "mass")},
+        "command_limits": f"[{max(abs(spec.v_min), spec.v_max)}, {spec.omega_max}]",
+    }
     lines = [
         "schema = 1",
         f"vehicle = {json.dumps(spec.name)}",
-        f'drive = "{spec.drive}"',
-        f'driven_axle = "{spec.driven_axle}"',
-        *(f"{key} = {getattr(spec, key)}" for key in ("wheel_radius", "track", "wheelbase", "mass")),
-        f"command_limits = [{max(abs(spec.v_min), spec.v_max)}, {spec.omega_max}]",
+        *(f"{key} = {value}" for key, value in of_vehicle.items() if stated is None or key in stated),
         f"held_out = [{names}]",
         *(f"{key} = {_toml(value)}" for key, value in (more or {}).items()),
     ]
