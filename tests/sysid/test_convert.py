@@ -738,3 +738,42 @@ def test_trials_of_a_dataset_of_another_vehicle_or_time_out_do_not_join(tmp_path
         write_dataset(tmp_path / name, fields)
         with pytest.raises(ValueError, match=f"its {said}, and that of the new trials is 0"):
             convert(ConvertConfig(tmp_path / "a", tmp_path / name))
+
+
+def unstamped(rows, *which, topic=ODOMETRY):
+    """Rows whose messages of a topic have a header stamp of zero, those of the numbers `which`."""
+    mine = [k for k, row in enumerate(rows) if row[1] == topic]
+    chosen = {mine[k] for k in which}
+    return [(*row[:3], replace(row[3], header=header(0.0))) if k in chosen else row for k, row in enumerate(rows)]
+
+
+@pytest.mark.parametrize("stamp", ["receive", "header"])
+def test_one_message_without_a_stamp_does_not_switch_off_the_checks_of_the_clock(tmp_path, stamp):
+    def edit(rows):
+        return receive_at(lambda t: set_at(t, -2.0))(unstamped(rows, 0))
+
+    write_bag(tmp_path / "bag", topics=(COMMAND, ODOMETRY, ""), edit=edit)
+    with pytest.raises(ValueError, match="recorder's clock was set back by 2 s"):
+        convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", stamp=stamp))
+
+
+@pytest.mark.parametrize("which", [(60,), (60, 100, 200, 201)])
+def test_measurements_without_a_stamp_among_others_are_left_out_and_counted(tmp_path, which):
+    write_bag(tmp_path / "bag", edit=lambda rows: unstamped(rows, *which))
+    whole, _ = convert(ConvertConfig(write_bag(tmp_path / "whole"), tmp_path / "all", stamp="header"))
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", stamp="header"))
+    assert any(f"{len(which)} messages with a header stamp of zero, though" in note for note in notes)
+    expected = np.delete(whole.trials[0].odometry.values, [k - 1 for k in which], axis=0)  # it begins with the pose
+    np.testing.assert_allclose(log.trials[0].odometry.values, expected, atol=1e-6)
+
+
+def test_commands_without_a_stamp_among_others_are_kept(tmp_path):
+    def edit(rows):
+        return unstamped(rows, 0, 50, 80, topic=COMMAND)
+
+    write_bag(tmp_path / "bag", stamped=True, edit=edit)
+    write_bag(tmp_path / "whole", stamped=True)
+    log, notes = convert(ConvertConfig(tmp_path / "bag", tmp_path / "log", stamp="header"))
+    whole, _ = convert(ConvertConfig(tmp_path / "whole", tmp_path / "all", stamp="header"))
+    assert any("3 messages with a header stamp of zero are stamped like those around" in note for note in notes)
+    np.testing.assert_allclose(log.trials[0].command.table, whole.trials[0].command.table, atol=2e-6)

@@ -28,11 +28,12 @@ def inverse(x, y, yaw):
     return -np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x - np.cos(yaw) * y, -yaw
 
 
-def bag_of_frames(folder, links, keep=(), storage=StoragePlugin.SQLITE3, **named):
+def bag_of_frames(folder, links, keep=(), storage=StoragePlugin.SQLITE3, unstamped=(), **named):
     """A recording with the commands of `motion`, topics to keep, and rows of transforms at 20 Hz: each a function of
     the time, the pose, which gives (parent, child, x, y, yaw) or None, and static ones of (parent, child, x, y, yaw).
 
-    `links` are those of /tf, or by the topic of each namespace; `named` goes to `write_bag`.
+    `links` are those of /tf, or by the topic of each namespace; `unstamped` are messages whose stamp is zero; `named`
+    goes to `write_bag`.
     """
     def edit(rows):
         made = [row for row in rows if row[1] in (COMMAND, *keep)]
@@ -40,7 +41,7 @@ def bag_of_frames(folder, links, keep=(), storage=StoragePlugin.SQLITE3, **named
             for k, t in enumerate(np.arange(0.01, 21.0, 0.05)):
                 for one in ones:
                     if callable(one) and (found := one(k, t, *motion(t)[2:])) is not None:
-                        made.append((t + 0.02, topic, KIND, link(t, *found)))
+                        made.append((t + 0.02, topic, KIND, link(-T0 if k in unstamped else t, *found)))
             made += [(0.0, f"{topic}_static", KIND, link(0.0, *one)) for one in ones if not callable(one)]
         return sorted(made, key=lambda row: row[0])
 
@@ -238,3 +239,10 @@ def test_a_pose_beside_frames_without_a_chain_is_named_first_and_can_be_taken(tm
     assert log.trials[0].ground_truth is not None
     with pytest.raises(ValueError, match="^[^:]*: /tf: no links lead from 'map' to 'base_link'"):
         convert(ConvertConfig(bag, tmp_path / "other", truth_topic="/tf:map:base_link"))
+
+
+def test_single_transforms_without_a_stamp_do_not_hide_a_clock_that_was_set(tmp_path):
+    bag = bag_of_frames(tmp_path / "drive", [odom], unstamped=(0, 200), stamped=True)
+    log, _ = convert(ConvertConfig(bag, tmp_path / "data", stamp="header"))
+    x, y = motion(log.trials[0].odometry.t - log.trials[0].odometry.t[0] + 0.06)[2:4]
+    np.testing.assert_allclose([log.trials[0].odometry.x, log.trials[0].odometry.y], [x, y], atol=1e-2)

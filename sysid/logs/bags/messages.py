@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS
 from sysid.logs.bags.wheel_states import chair_row, joint_row
 from sysid.logs.planar import yaw_of
@@ -54,6 +56,12 @@ def header_time(message: Any) -> float:
     """Header stamp [s]; nan where the message has none."""
     header = getattr(message, "header", None)
     return float("nan") if header is None else header.stamp.sec + header.stamp.nanosec * 1e-9
+
+
+def without_stamp(stamped: np.ndarray) -> np.ndarray:
+    """Which stamps (T,) [s] are zero although most are set: of a driver that does set them (T,) bool."""
+    zero = stamped <= 0
+    return zero if zero.mean() < 0.5 else np.zeros(len(stamped), bool)
 
 
 def sideways_speed(message: Any) -> float:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.bags.frames import frame_streams, unposed
-from sysid.logs.bags.messages import header_time, read_message, sideways_speed
+from sysid.logs.bags.messages import header_time, read_message, sideways_speed, without_stamp
 from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS, OPTIONS, PACKED, SUFFIXES, Bag, BagStream, short_type
 from sysid.logs.bags.topics import choose_topics, framed, no_pose, not_read
 from sysid.logs.bags.wheel_states import CHAIR_DEFINITION, COARSE, JOYSTICK_FIELDS, chair_odometry, joint_twist
@@ -153,6 +153,12 @@ def _usable(
     finite = np.isfinite(table[:, 2:]).all(axis=1) | (kind == "JointState") & ~unset
     far = np.abs(table[:, 0] - np.median(table[:, 0])) > DAY
     far &= far.mean() < STRAY
+    blank = without_stamp(table[:, 1])
+    if stream == "command" and blank.any():  # what was sent counts
+        rows, late = np.arange(len(table)), table[:, 0] - table[:, 1]
+        table[blank, 1] = table[blank, 0] - np.interp(rows[blank], rows[~blank & ~far], late[~blank & ~far])
+        notes.append(f"{topic}: {blank.sum()} messages with a header stamp of zero are stamped like those around them")
+        blank[:] = False
     if unset.all():
         if kind == "JointState":
             raise ValueError(f"{path}: topic {topic}: no joint is called left or right. Name another topic with "
@@ -161,8 +167,9 @@ def _usable(
                          f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
     notes += [f"{topic}: {which.sum()} messages {what} are left out" for which, what in (
         (unset, "with an orientation that is all zero"), (~finite & ~unset, "with numbers that are not finite"),
-        (finite & far, "whose time is more than a day from the others'")) if which.any()]
-    return table[finite & ~far]
+        (finite & far, "whose time is more than a day from the others'"),
+        (finite & ~far & blank, "with a header stamp of zero, though the others have one,")) if which.any()]
+    return table[finite & ~far & ~blank]
 
 
 def _too_few(path: Path, topic: str, count: int, stream: str) -> ValueError:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.logs.bags.messages import without_stamp
 from sysid.logs.planar import DIFFERENCED, pose_speeds, yaw_of
 from whill_mjx.io.fields import shown
 
@@ -275,7 +276,8 @@ def _moves(rows: Sequence[tuple[float, ...]]) -> bool:
 
 
 def _sorted(table: np.ndarray) -> np.ndarray:
-    """Rows in order of their stamps where these are set, else of receipt."""
+    """Rows in order of their stamps where these are set, else of receipt; single ones without a stamp are left out."""
+    table = table[~without_stamp(table[:, 1])]
     return table[np.argsort(table[:, 1] if (table[:, 1] > 0).all() else table[:, 0], kind="stable")]
 
 
