@@ -277,7 +277,7 @@ def _spec(config: ConvertConfig, there: VehicleSpec | None, noted: VehicleSpec |
     return in_proportion(WHILL_CR, config.vehicle, **changes)
 
 
-def _given(config: ConvertConfig) -> dict[str, float]:
+def _given(config: ConvertConfig) -> dict[str, Any]:
     """Sizes that options state."""
     return {key: value for key in ("wheel_radius", "track", "mass") if (value := getattr(config, key)) is not None}
 

@@ -39,6 +39,9 @@ START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command 
 SLOWEST = 4.0  # s between rows that no log has in all of its streams
 LEAST_ROWS = 10  # of a stream to be asked for its rate
 LONGER = 200.0  # times that one stream of a trial lasts as long as another, which no recording does
+LEAST_WAY, WAY_POINTS = 0.3, 100  # m or rad that poses show, and how many of them are looked at
+DOUBTED = 0.5  # s between rows, above which t may be in milliseconds as well: its rows come at below 2 kHz then
+UNLIKE = 3.0  # factor by which the way by the speeds differs from that of the poses at most, in the right unit of time
 TIME_UNITS = (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3))
 
 COMMAND_COLUMNS = ("t", "v", "omega")
@@ -92,6 +95,7 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
         "ground_truth.csv", ground_truth)) if one is not None})
     for name, stream in (("odometry.csv", odometry), ("ground_truth.csv", ground_truth)):
         if stream is not None:
+            _check_way(folder / name, stream, odometry or command)
             _check_reach(folder / name, stream, command)  # before unwrapping, which would hide degrees
     if odometry is not None and odometry.yaw is not None:
         odometry = replace(odometry, yaw=np.unwrap(odometry.yaw))
@@ -236,6 +240,27 @@ def _check_seconds(folder: Path, times: dict[str, np.ndarray]) -> None:
         raise ValueError(f"{folder / name}: t steps by {step:g} from row to row, a rate of {1 / step:.2g} Hz if that "
                          f"were seconds{others}: it seems to be in {unit}. Divide t by {size:.0f}"
                          f"{' in all streams' if not others and len(times) > 1 else ''}.")
+
+
+def _check_way(path: Path, stream: OdometryStream | PoseStream, speeds: OdometryStream | Command) -> None:
+    """Refuse poses that are as much shorter a way than the speeds give as seconds are longer than a smaller unit."""
+    if len(stream.t) < LEAST_ROWS or stream.x is None or stream.y is None or stream.yaw is None:
+        return
+    if not DOUBTED <= float(np.median(np.diff(stream.t))) <= SLOWEST:
+        return
+    few = np.linspace(0, len(stream.t) - 1, min(len(stream.t), WAY_POINTS)).astype(int)  # noise adds up in many
+    way = float(np.hypot(np.diff(stream.x[few]), np.diff(stream.y[few])).sum())
+    turn = float(np.abs(np.diff(np.unwrap(stream.yaw)[few])).sum())
+    inside = (speeds.t >= stream.t[0]) & (speeds.t <= stream.t[-1])
+    held = np.diff(np.append(speeds.t[inside], stream.t[-1]))
+    for moved, speed, unit in ((way, speeds.v, "m"), (turn, speeds.omega, "rad")):
+        said = float((np.abs(speed[inside]) * held).sum())
+        times = said / moved if moved > LEAST_WAY else 0.0
+        for name, size in TIME_UNITS:
+            if size / UNLIKE < times < size * UNLIKE:
+                raise ValueError(f"{path}: the speeds give {said:.3g} {unit} in {np.ptp(stream.t):.5g} s, the "
+                                 f"poses {moved:.3g} {unit}: t seems to be in {name}. Divide t by {size:.0f} in all "
+                                 "streams.")
 
 
 def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Command) -> None:

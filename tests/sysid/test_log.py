@@ -7,8 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from sysid.logs.log import load_log
+from sysid.logs.log import load_log, load_trial
 from sysid.logs.measured import load_any
+from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import manoeuvre_of
 from sysid.logs.streams import trial_quality
 from whill_mjx.logs.dataset import write_csv, write_text
@@ -254,3 +255,24 @@ def test_times_in_another_unit_than_seconds_are_named_at_once(dataset, unit, fac
         write_csv(file, header, np.column_stack([factor * table[:, 0], table[:, 1:]]))
     with pytest.raises(ValueError, match=f"straight_1.*{said}"):
         load_log(dataset)
+
+
+@pytest.mark.parametrize("streams", [("odometry",), ("ground_truth",), ("odometry", "ground_truth")])
+@pytest.mark.parametrize(("rate", "unit"), [(500, 1e3), (1000, 1e3), (20, 1.0), (1, 1.0)])
+def test_milliseconds_of_a_quick_log_are_refused_by_the_way_that_was_driven(tmp_path, streams, rate, unit):
+    t = np.arange(0.0, 20.0 if rate > 1 else 300.0, 1 / rate)
+    v, omega = 0.4 + 0.1 * np.sin(t / 3), 0.2 * np.sin(t / 5)
+    x, y, yaw = integrate_speeds(t, v, omega)
+    x = x + np.random.default_rng(0).normal(0, 0.002, len(t))
+    tables = {"command": ("t,v,omega", (v, omega)), "odometry": ("t,x,y,yaw,v,omega", (x, y, yaw, v, omega)),
+              "ground_truth": ("t,x,y,yaw", (x, y, yaw))}
+    folder = tmp_path / "circle_1"
+    folder.mkdir()
+    for name in ("command", *streams):
+        head, columns = tables[name]
+        np.savetxt(folder / f"{name}.csv", np.column_stack([unit * t, *columns]), "%.6f", ",", header=head, comments="")
+    if unit == 1.0:
+        assert load_trial(folder).duration == pytest.approx(t[-1])
+        return
+    with pytest.raises(ValueError, match=f"{streams[0]}.csv: the speeds give .*t seems to be in milliseconds. Divide"):
+        load_trial(folder)

@@ -15,7 +15,10 @@ from bridge.whill import ChairState, WheelOdometry
 from sysid.logs.bags.wheel_states import chair_odometry, chair_row, joint_row, joint_twist
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log
+from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import Command, with_timeout
+from sysid.logs.tables.columns import Table
+from sysid.logs.tables.guess import guess
 from sysid.logs.tables.text_table import read_table
 from sysid.replay.wheel_model import wheel_model
 from sysid.search.fitting import check_settings
@@ -600,3 +603,52 @@ def test_who_says_which_columns_are_the_wheel_commands_needs_no_word_on_a_set_sp
         ("command.left", "command.right", "wheels.left", "wheels.right"), names, strict=True))
     log, _ = convert(ConvertConfig(path, tmp_path / "log", columns=said, wheel_radius=0.1, track=0.5))
     check(log.trials[0], pose=False)
+
+
+DRIVES = {  # v and omega of 60 s, and whether the path shows where the vehicle heads
+    "circles": (lambda t: 0.5 + 0 * t, lambda t: 0.6 + 0 * t), "spin": (lambda t: 0 * t, lambda t: 0.6 + 0 * t),
+    "nearly straight": (lambda t: 0.5 + 0 * t, lambda t: 0.05 * np.sin(0.3 * t)),
+    "there and back": (lambda t: 0.5 * (t % 15 < 10), lambda t: 0.628 * (t % 15 >= 10)),
+}
+
+
+@pytest.mark.parametrize("lever", [0.0, 0.3])
+@pytest.mark.parametrize(("size", "unit"), [(1.0, "rad"), (180 / np.pi, "deg")])
+@pytest.mark.parametrize("drive", DRIVES)
+def test_the_unit_of_a_heading_is_that_in_which_it_follows_its_path_or_the_commands(drive, size, unit, lever):
+    t, noise = np.arange(0.0, 60.0, 0.05), np.random.default_rng(0).normal(size=(3, 1200))
+    v, omega = (of(t) for of in DRIVES[drive])
+    x, y, yaw = integrate_speeds(t, v, omega)
+    x, y = x + lever * np.cos(yaw) + 0.003 * noise[0], y + lever * np.sin(yaw) + 0.003 * noise[1]
+    table = {"t": t, "cmd_v": v, "cmd_w": size * omega, "gt_x": x, "gt_y": y,
+             "gt_yaw": size * (yaw + 1.0 + 0.005 * noise[2])}
+    found = {one.role: one for one in guess([Table("drive", table)])}
+    assert found["ground_truth.yaw"].sure and found["ground_truth.yaw"].unit == unit
+    if drive != "nearly straight":  # nothing else would show 0.05 rad/s from 3 deg/s
+        assert found["command.omega"].unit == f"{unit}/s"
+
+
+def test_a_heading_that_nothing_else_shows_the_unit_of_is_asked_for(tmp_path):
+    t = np.arange(0.0, 30.0, 0.05)
+    table = {"t": t, "cmd_v": 0 * t, "cmd_w": 0 * t, "gt_x": 0 * t, "gt_y": 0 * t, "gt_yaw": 0.4 * t}
+    path = write(tmp_path / "pushed.csv", table)
+    with pytest.raises(ValueError, match="not clear what pushed/gt_yaw is"):
+        convert(ConvertConfig(path, tmp_path / "log"))
+
+
+@pytest.mark.parametrize(("rate", "seconds", "size", "unit"), [
+    (500, 20, 1e3, "asks"), (1000, 20, 1e6, "asks"), (500, 20, 1e9, "asks"),
+    (200, 20, 1e3, "ms"), (200, 20, 1e6, "us"), (100, 20, 1e9, "ns"),
+    (500, 20, 1.0, "s"), (1, 300, 1.0, "s"), (0.5, 600, 1.0, "s"), (1, 300, 1e3, "ms"),
+    (0.15, 120, 1.0, "s"),
+])
+def test_a_step_of_time_that_fits_two_units_is_asked_for(rate, seconds, size, unit):
+    t = np.arange(0.0, seconds, 1 / rate)
+    found = {one.role: one for one in guess([Table("drive", {"t": size * t, "cmd_v": 0 * t, "cmd_w": 0 * t})])}
+    assert (found["time"].unit if found["time"].sure else "asks") == unit
+
+
+def test_of_seconds_since_1970_one_a_second_is_no_millisecond():
+    t = 1.7e9 + np.arange(0.0, 3000.0, 1.0)
+    (time, *_) = guess([Table("drive", {"t": t, "cmd_v": 0 * t, "cmd_w": 0 * t})])
+    assert time.sure and time.unit == "s"

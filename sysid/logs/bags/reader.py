@@ -155,8 +155,8 @@ def _usable(
     far &= far.mean() < STRAY
     blank = without_stamp(table[:, 1])
     if stream == "command" and blank.any():  # what was sent counts
-        rows, late = np.arange(len(table)), table[:, 0] - table[:, 1]
-        table[blank, 1] = table[blank, 0] - np.interp(rows[blank], rows[~blank & ~far], late[~blank & ~far])
+        number, late, good = np.arange(len(table)), table[:, 0] - table[:, 1], ~blank & ~far
+        table[blank, 1] = table[blank, 0] - np.interp(number[blank], number[good], late[good])
         notes.append(f"{topic}: {blank.sum()} messages with a header stamp of zero are stamped like those around them")
         blank[:] = False
     if unset.all():

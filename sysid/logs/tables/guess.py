@@ -72,7 +72,7 @@ def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str
     votes: dict[tuple[str, str], Counter[str]] = {}
     for columns in drives:
         for one in columns:
-            if (one.moves or not one.assumed) and one.role != "time":
+            if one.sure and (one.moves or not one.assumed) and one.role != "time":
                 votes.setdefault((one.role, one.name), Counter())[one.unit] += 100 if one.assumed else 101
     return {key: vote.most_common(1)[0][0] for key, vote in votes.items()}
 

@@ -10,13 +10,21 @@ import numpy as np
 from sysid.logs.planar import yaw_of
 from sysid.logs.tables.columns import UNITS, Column, is_unit_of, kind_of, size_of
 
-FASTEST_STEP = 5e-4  # s; rows that follow faster are in another unit of time
+FASTEST_STEP, SLOWEST_STEP = 5e-4, 4.0  # s; rows that follow faster, or slower, are in another unit of time
+SHORTEST = 1.0  # s; a recording that would be shorter is in a larger unit
+DATES = (1e9, 1e10)  # s since 1970
 SERIAL_DAYS, DAY_STEP = ((2e4, 6e4), (7.2e5, 7.6e5)), 5e-5
 """Ranges of dates that count days, as spreadsheets and MATLAB have them, and the longest step of such a recording."""
 TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
 TOO_SLOW = 0.02  # m/s; a pose that never moves faster shows no unit
 TURNED = 0.3  # rad; the same of a heading
+FULL_TURN = 0.9  # of it, beyond which the step between two rows is that of a heading that begins anew
+ALONG, CLEARER = 0.5, 4.0
+"""How well a heading follows the path (1 is exactly), at least, and how many times less well that of another unit."""
+STEPPED = 0.5  # s over which a path has a direction
+FOLLOWED, SLIPPED = 0.5, 3.0  # correlation of the turns with a yaw rate, and the factor by which they may be another's
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
+LARGEST_SI = 4.0  # m/s and rad/s that speeds of a vehicle usually stay below
 GAP = 2.0  # s without samples, over which nothing is interpolated
 
 
@@ -32,10 +40,13 @@ def with_time_unit(column: Column, values: np.ndarray) -> Column:
             return replace(column, unit=unit, why="it counts since 1970")
     if step < DAY_STEP and any(low < first < high for low, high in SERIAL_DAYS):
         return replace(column, unit="d", why="it counts days")
-    for unit, longest in (("s", 4.0), ("ms", 4e3), ("us", 4e6)):
-        if step < longest:
-            return replace(column, unit=unit, why=f"it steps by {step:.3g}", sure=column.sure and step > FASTEST_STEP)
-    return replace(column, unit="ns", why=f"it steps by {step:.3g}")
+    span = float(np.ptp(known)) if len(known) else 0.0
+    quickest = min(step, span / (len(known) - 1)) if len(known) > 1 else step  # rounded times repeat
+    able = [unit for unit in ("s", "ms", "us", "ns") if quickest * UNITS["time"][unit] > FASTEST_STEP
+            and (unit == "s" or span * UNITS["time"][unit] >= SHORTEST)]
+    usual = [unit for unit in able if step * UNITS["time"][unit] < SLOWEST_STEP]
+    clear = len(usual or able) == 1 or "s" in usual and DATES[0] < first < DATES[1]
+    return replace(column, unit=(usual or able or ["s"])[0], why=f"it steps by {step:.3g}", sure=column.sure and clear)
 
 
 def with_units(found: list[Column], arrays: Mapping[tuple[str, str], np.ndarray]) -> list[Column]:
@@ -64,7 +75,7 @@ def _with_some_unit(one: Column, values: np.ndarray) -> Column:
     if is_unit_of(one.role, one.unit):
         return one
     usual = float(np.nanpercentile(np.abs(values), 95)) if np.isfinite(values).any() else 0.0
-    largest = 40.0 if wheel else {"speed": 4.0, "rate": 4.0}.get(kind_of(one.role), np.inf)
+    largest = 40.0 if wheel else LARGEST_SI if kind_of(one.role) in ("speed", "rate") else np.inf
     return replace(one, unit=next(iter(UNITS[kind_of(one.role)])), why=f"{one.why}; SI assumed",
                    sure=one.sure and usual < largest, assumed=True, moves=usual > 0.05)
 
@@ -116,12 +127,14 @@ class _Known:
                     self.columns[one.role] = replace(one, unit=str(unit), why=f"{one.why}; as the vehicle moves")
 
     def settle_pose(self, stream: str) -> None:
-        """Find the units of a pose: of its heading by the range, of its place by how fast it moves."""
+        """Find the units of a pose: of its heading by what it follows, of its place by how fast it moves."""
         role = f"{stream}.yaw"
         if (one := self.columns.get(role)) and one.unit not in UNITS["angle"] and (mine := self.raw(role)):
-            degrees = bool(np.ptp(mine[1]) > 30)
-            self.columns[role] = replace(one, unit="deg" if degrees else "rad", why=f"{one.why}; its range",
-                                         assumed=not degrees, moves=bool(np.ptp(mine[1]) > TURNED))
+            span = float(np.ptp(mine[1]))
+            shown = _begun_anew(mine[1]) or self._along_path(stream, mine) or self._as_turned(mine)
+            unit, why = shown or ("deg" if span > 30 else "rad", "its range")
+            self.columns[role] = replace(one, unit=unit, why=f"{one.why}; {why}", assumed=shown is None,
+                                         sure=one.sure and (shown is not None or span < TURNED), moves=span > TURNED)
         axes = [self.raw(f"{stream}.{axis}") for axis in ("x", "y")]
         rate = max((float(np.percentile(np.abs(_rate(*one)[1]), 90)) for one in axes if one is not None), default=0.0)
         for role in (f"{stream}.x", f"{stream}.y"):
@@ -131,6 +144,42 @@ class _Known:
         for role in (f"{stream}.{one}" for one in ("qx", "qy", "qz", "qw")):
             if one := self.columns.get(role):
                 self.columns[role] = replace(one, unit="-")
+
+    def _along_path(self, stream: str, yaw: tuple[np.ndarray, np.ndarray]) -> tuple[str, str] | None:
+        """The unit in which a heading follows the direction of the path, and why; None where several do, or none."""
+        x, y = self.raw(f"{stream}.x"), self.raw(f"{stream}.y")
+        if x is None or y is None or len(x[0]) != len(y[0]):
+            return None
+        (t, dx), (_, dy) = _rate(*x, STEPPED), _rate(*y, STEPPED)
+        way, double = np.hypot(dx, dy), 2 * np.arctan2(dy, dx)  # twice the angle: it may drive backwards
+        moving = way > 0.3 * np.percentile(way, 95)
+        if not moving.any():
+            return None
+        apart = {}
+        for unit in ("rad", "deg"):
+            turned = 2 * np.interp(t, yaw[0], np.unwrap(yaw[1] * UNITS["angle"][unit]))
+            both = [np.average(np.exp(1j * (double + sign * turned))[moving], weights=way[moving]) for sign in (-1, 1)]
+            apart[unit] = 1 - float(np.abs(both).max())
+        unit, other = sorted(apart, key=lambda one: apart[one])
+        clear = apart[unit] < 1 - ALONG and apart[other] > CLEARER * apart[unit] + 0.01
+        return (unit, "as the path turns") if clear else None
+
+    def _as_turned(self, yaw: tuple[np.ndarray, np.ndarray]) -> tuple[str, str] | None:
+        """The unit in which a heading turns as fast as a yaw rate says, and why; None where neither is."""
+        roles = [role for role in ("odometry.omega", "command.omega") if role in self.columns]
+        for role in sorted(roles, key=lambda one: self.signal(one) is None):
+            known, rate = self.signal(role), self.raw(role)
+            if rate is None:
+                continue
+            size, why = UNITS["angle"]["deg"], f"as {role}"
+            gains = {unit: _gain((yaw[0], np.unwrap(yaw[1] * UNITS["angle"][unit])), known or rate)
+                     for unit in ("rad", "deg")}
+            if near := [unit for unit, gain in gains.items() if _is_near(gain)]:
+                both_degrees = known is None and near == ["rad"] and np.percentile(np.abs(rate[1]), 95) > LARGEST_SI
+                return ("deg" if both_degrees else near[0]), why
+            if known is None and _is_near(gains["rad"] / size):
+                return "rad", why
+        return None
 
     def heading(self, stream: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Times [s] and heading [rad] of a pose, without jumps."""
@@ -171,12 +220,36 @@ def _unit_like(
     return unit if abs(np.log(ratio / apart[unit])) < np.log(1 + loose) + 0.05 else None
 
 
-def _rate(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rate of a signal (T,) over 0.2 s, at 20 Hz."""
-    grid = _grid(t, t[0] + 0.1, t[-1] - 0.1)
+def _begun_anew(yaw: np.ndarray) -> tuple[str, str] | None:
+    """The unit in which a heading (T,) stays within a full turn and steps by one, and why; None where it does not."""
+    span, step = float(np.ptp(yaw)), float(np.abs(np.diff(yaw)).max())
+    for unit, turn in (("rad", 2 * np.pi), ("deg", 360.0)):
+        if FULL_TURN * turn < step and span < 1.01 * turn:
+            return unit, "its full turns"
+    return None
+
+
+def _gain(heading: tuple[np.ndarray, np.ndarray], rate: tuple[np.ndarray, np.ndarray]) -> float:
+    """How many times as fast a heading turns as a yaw rate says; 0 where it does not follow it."""
+    t, turned = _rate(*heading)
+    inside = (t >= rate[0][0]) & (t <= rate[0][-1])
+    turned, said = turned[inside], np.interp(t[inside], *rate)
+    size = float(np.linalg.norm(turned) * np.linalg.norm(said))
+    if len(said) < 40 or np.abs(said).max() < 1e-3 or abs(turned @ said) <= FOLLOWED * size:
+        return 0.0
+    return abs(float(turned @ said / (said @ said)))
+
+
+def _is_near(gain: float) -> bool:
+    return 1 / SLIPPED < gain < SLIPPED
+
+
+def _rate(t: np.ndarray, values: np.ndarray, over: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
+    """Rate of a signal (T,) over so many seconds, at 20 Hz."""
+    grid = _grid(t, t[0] + over / 2, t[-1] - over / 2)
     if len(grid) < 2:
         return t[:1], np.zeros(1)
-    return grid, (np.interp(grid + 0.1, t, values) - np.interp(grid - 0.1, t, values)) / 0.2
+    return grid, (np.interp(grid + over / 2, t, values) - np.interp(grid - over / 2, t, values)) / over
 
 
 def _grid(t: np.ndarray, begin: float, end: float) -> np.ndarray:
