@@ -87,7 +87,8 @@ def _vehicle_there(config: ConvertConfig) -> VehicleSpec | None:
         if asked in (getattr(ConvertConfig, key), mine):
             continue
         flag = f"--{key.replace('_', '-')}"
-        correct = f" correct {key} there," if key in ("mass", "command_timeout") else ""  # nothing was computed with it
+        uses_none = key in ("mass", "command_timeout")  # nothing that is there was computed with it
+        correct = f" write {key} = {asked:g} there," if uses_none else ""
         raise ValueError(f"{path}: {key} is {mine}, and {flag} {asked} differs. Leave {flag} out,{correct} or choose "
                          "another --out.")
     return spec

@@ -704,7 +704,7 @@ def test_a_robot_that_is_not_built_in_is_in_proportion_and_only_what_was_given_i
 
 @pytest.mark.parametrize(("options", "said"), [
     ({"track": 0.5}, r"track is 0.4, and --track 0.5 differs. Leave --track out, or choose another --out"),
-    ({"mass": 7.0}, r"mass is 52.0, and --mass 7.0 differs. Leave --mass out, correct mass there, or choose"),
+    ({"mass": 7.0}, r"mass is 52.0, and --mass 7.0 differs. Leave --mass out, write mass = 7 there, or choose"),
     ({"command_timeout": 0.5}, r"command_timeout is not stated, and --command-timeout 0.5 differs"),
     ({"vehicle": "husky"}, r"vehicle is whill_cr, and --vehicle husky differs"),
 ])

@@ -607,6 +607,7 @@ def test_who_says_which_columns_are_the_wheel_commands_needs_no_word_on_a_set_sp
 
 DRIVES = {  # v and omega of 60 s, and whether the path shows where the vehicle heads
     "circles": (lambda t: 0.5 + 0 * t, lambda t: 0.6 + 0 * t), "spin": (lambda t: 0 * t, lambda t: 0.6 + 0 * t),
+    "one turn": (lambda t: 0.4 + 0 * t, lambda t: 0.3 * ((t > 5) & (t < 8))),
     "nearly straight": (lambda t: 0.5 + 0 * t, lambda t: 0.05 * np.sin(0.3 * t)),
     "there and back": (lambda t: 0.5 * (t % 15 < 10), lambda t: 0.628 * (t % 15 >= 10)),
 }

@@ -25,6 +25,7 @@ STEPPED = 0.5  # s over which a path has a direction
 FOLLOWED, SLIPPED = 0.5, 3.0  # correlation of the turns with a yaw rate, and the factor by which they may be another's
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
 LARGEST_SI = 4.0  # m/s and rad/s that speeds of a vehicle usually stay below
+BUSY = 0.3  # of its usual largest, above which a signal is compared: a vehicle may turn seldom
 GAP = 2.0  # s without samples, over which nothing is interpolated
 
 
@@ -209,7 +210,10 @@ def _unit_like(
     ours, theirs = (np.abs(np.interp(t, *one)) for one in (mine, reference))
     if max(ours.max(), theirs.max()) < 1e-6 or ours.max() < 1e-9 or theirs.max() < 1e-3:
         return None
-    ratio = float(np.percentile(theirs, 90) / max(np.percentile(ours, 90), 1e-12))
+    busy = np.convolve(ours > BUSY * np.percentile(ours, 99), np.ones(39), "same") > 0  # and 1 s around: it may be late
+    if not busy.any():
+        return None
+    ratio = float(np.percentile(theirs[busy], 90) / max(np.percentile(ours[busy], 90), 1e-12))
     apart: dict[str, float] = {}  # ft/s, for example, is too near to km/h for numbers to separate them
     for one, size in units.items():
         if all(abs(np.log(size / other)) > np.log(1 + ALIKE) for other in apart.values()):
