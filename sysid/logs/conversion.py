@@ -53,19 +53,21 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
     if not drives:
         raise ValueError(f"{config.source}: no drive in it moves for {SHORTEST:g} s. Check --command-topic, or use "
                          "--split bag.")
-    unknown = sorted(set(config.held_out) - {drive.name for drive in drives})
+    names = {drive.name for drive in drives}
+    unknown = sorted(set(config.held_out) - names)
     if unknown:
         raise ValueError(f"--held-out {unknown[0]}: no such trial was made (made: "
                          f"{', '.join(drive.name for drive in drives[:20])}). Correct the name.")
     if config.command_timeout is not None:
         found = replace(found, more={**found.more, "command_timeout": config.command_timeout})
-    held_out = config.held_out or (found.held_out if there is None else ())
+    kept_out = [name for name in found.held_out if name in names]
+    held_out = config.held_out or (kept_out if there is None else ())
     notes = [*found.notes, *write_dataset(config.out, found, held_out, config.source)]
     log = load_log(config.out)
-    if fitted := sorted(set(found.held_out) - {trial.name for trial in log.held_out}) if there is not None else []:
+    if there is not None and (fitted := sorted(set(kept_out) - {trial.name for trial in log.held_out})):
         notes.append(f"{', '.join(fitted)}: held out in {config.source}, but not here. Add "
                      f"{'it' if len(fitted) == 1 else 'them'} to held_out of {config.out / 'dataset.toml'}")
-    made = log.select(lambda trial: trial.name in {drive.name for drive in drives})
+    made = log.select(lambda trial: trial.name in names)
     again = any("Convert again" in note for note in notes)  # what is odd is of the times that were taken
     return log, notes if again else [*notes, *(f"! {one}" for one in sanity(made))]
 
