@@ -235,9 +235,9 @@ def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
     """State before the first step; `env` is a vector environment (`num_envs`, `obs_shape`, `action_dim`, reset, step).
 
     Raises:
-        ValueError: the minibatches do not divide a rollout.
+        ValueError: the minibatches do not divide a rollout, or scans have several lengths.
     """
-    check_minibatches(config, env.num_envs)
+    check_fit(env, config)
     env_key, net_key, key = jax.random.split(jax.random.key(seed), 3)
     env_state, step = env.reset(env_key)
     empty = empty_frames(config, env.obs_shape, (env.num_envs,))
@@ -250,8 +250,11 @@ def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
     )  # fmt: skip
 
 
-def check_minibatches(config: PpoConfig, instances: int) -> None:
-    """Raise ValueError unless the minibatches divide a rollout of this many instances."""
+def check_fit(env: Any, config: PpoConfig) -> None:
+    """Raise ValueError where the minibatches do not divide a rollout, or scans have several lengths."""
+    instances = env.num_envs
+    if isinstance(env.obs_shape, Mapping):
+        rays_of(config, env.obs_shape)
     if instances * config.rollout % config.minibatches:
         raise ValueError(
             f"{instances} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "

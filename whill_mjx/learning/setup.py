@@ -17,6 +17,7 @@ import numpy as np
 from dreamer import agent as agents
 from dreamer.config import DreamerConfig
 from dreamer.config import preset as learner_preset
+from dreamer.iteration import check_fit
 from dreamer.types import FunctionalEnv, Mirror, Transition
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import POSE_METRICS, Env, State, make_env
@@ -179,11 +180,16 @@ def _changed(holder: Any, changes: Mapping[str, Any], where: str) -> Any:
     return dataclasses.replace(holder, **changes)
 
 
-def with_layout(preset: Preset, layout: str) -> Preset:
-    """The same training in worlds of this layout. Where all look alike, the mirror shows no more than one other."""
+def with_layout(preset: Preset, layout: str, looks: str | None = None) -> Preset:
+    """The same training in worlds of this layout and these looks; None keeps the preset's looks.
+
+    The mirror shows no more other worlds than there are.
+    """
     task = dataclasses.replace(preset.task, layout=layout)  # an unknown one is refused here
-    worlds = preset.learner.mirror if task.randomised else min(preset.learner.mirror, 1)
-    return dataclasses.replace(preset, task=task, learner=dataclasses.replace(preset.learner, mirror=worlds))
+    looks = preset.looks if looks is None else looks
+    worlds = min(preset.learner.mirror, mirror_worlds(make_env(task, looks=looks)[0]))
+    learner = dataclasses.replace(preset.learner, mirror=worlds)
+    return dataclasses.replace(preset, task=task, looks=looks, learner=learner)
 
 
 def with_repeat(preset: Preset, repeat: int) -> Preset:
@@ -332,10 +338,10 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
     what is learned from one drive is seen in several. Sensors are mirrored in one world; None where one of them cannot
     be.
     """
-    sensors = dict(batch.env.sensors)
+    sensors, most = dict(batch.env.sensors), mirror_worlds(batch.env)
+    if not most:
+        return None
     if sensors:
-        if any(sensor.mirrored is None for sensor in sensors.values()):
-            return None
         mirrors: dict[str, Any] = {name: sensor.mirrored for name, sensor in sensors.items()}
         mirrors[TRUTH] = privileged.mirrored
         return Mirror(
@@ -362,7 +368,23 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
         action = jnp.broadcast_to(action, (worlds, *action.shape))
         return turned(action, action * jnp.array([1.0, -1.0]))
 
-    return Mirror(other_obs, other_action, worlds=PAINTS if paints else 1)
+    return Mirror(other_obs, other_action, worlds=most)
+
+
+def mirror_worlds(env: Env) -> int:
+    """Other worlds that the mirror of an environment shows at most; 0 where it has none."""
+    if env.sensors:
+        return int(all(sensor.mirrored is not None for _, sensor in env.sensors))
+    return PAINTS if env.repaints else 1
+
+
+def check_learner(preset: Preset, learner: str, batch: BatchEnv) -> None:
+    """Raise ValueError where a preset's learner, "dreamer" or "ppo", does not suit what it would train on."""
+    env = functional_env(batch, preset.safety, targets=learner == "dreamer" and TRUTH in preset.learner.decode_only)
+    if learner == "dreamer":
+        check_fit(env, preset.learner)
+    else:
+        ppo.check_fit(env, preset.ppo)
 
 
 def make_training_env(preset: Preset, vehicle: str | Path | None, devices: tuple = ()) -> BatchEnv:
