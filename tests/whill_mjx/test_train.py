@@ -503,9 +503,34 @@ def test_a_longer_hold_keeps_the_budget_in_control_periods(name, factor):
     updates = [one.total_steps * one.learner.train_ratio / one.learner.replayed_per_update for one in (short, long)]
     assert updates[1] == pytest.approx(updates[0], rel=0.05)
     assert long.learner.learning_starts * factor == pytest.approx(short.learner.learning_starts, abs=factor)
+    assert long.ppo.discount == pytest.approx(short.ppo.discount**factor)
+    iterations = [one.total_steps / (one.instances * one.ppo.rollout) for one in (short, long)]
+    assert iterations[1] == pytest.approx(iterations[0]) and long.ppo.minibatches == short.ppo.minibatches
 
 
 @pytest.mark.quick
 def test_a_decision_must_hold():
     with pytest.raises(ValueError, match="action_repeat is 0"):
         with_repeat(find_preset("paper", "obstacle_course"), 0)
+
+
+def test_figures_and_limits_of_a_policy_are_computed_with_all_bits(monkeypatch):
+    """As the vehicle's runtime does: a GPU would round the factors of a product to TF32."""
+    from whill_mjx.evaluation.novelty import SURPRISE
+    from whill_mjx.learning import outcome
+
+    class Computed(Exception):
+        pass
+
+    def compute(*args):
+        raise Computed(jax.config.jax_default_matmul_precision)
+
+    options = TrainOptions(preset="smoke", planner=False)
+    preset, result = choose_preset(options), Trained({}, 0, 0, 0.0)
+    monkeypatch.setattr(outcome, "policy_of", lambda *args: (None, {SURPRISE: jnp.zeros(1)}))
+    monkeypatch.setattr(outcome, "evaluate_drivers", compute)
+    monkeypatch.setattr(outcome, "largest_surprise", compute)
+    with pytest.raises(Computed, match="highest"):
+        outcome.evaluate_policy(options, preset, "whill_cr_ramp", result)
+    with pytest.raises(Computed, match="highest"):
+        outcome.export(options, preset, "whill_cr_ramp", result, Path("policy"))

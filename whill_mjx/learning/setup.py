@@ -210,10 +210,14 @@ def with_repeat(preset: Preset, repeat: int) -> Preset:
         batch_length=length,
         batch_size=max(1, round(learner.replayed_per_update / length)),
     )
+    baseline = dataclasses.replace(
+        preset.ppo, discount=preset.ppo.discount**factor, rollout=max(1, round(preset.ppo.rollout / factor))
+    )
     return dataclasses.replace(
         preset,
         task=task,
         learner=learner,
+        ppo=baseline if factor != 1.0 else preset.ppo,
         total_steps=round(preset.total_steps / factor),
         eval_every=max(1, round(preset.eval_every / factor)),
     )
