@@ -307,13 +307,15 @@ def functional_env(
             step = dataclasses.replace(step, reward=step.reward - jnp.where(step.first, 0.0, lost))
         return state, emit(state, step)
 
-    shape = obs_shape_of(batch.env)
-    if targets:
-        seen = shape if isinstance(shape, dict) else {"camera": shape}
-        shape = {**seen, TRUTH: (privileged.SIZE,)}
+    shape = with_truth(obs_shape_of(batch.env)) if targets else obs_shape_of(batch.env)
     return FunctionalEnv(
         num_envs=batch.count, obs_shape=shape, action_dim=2, reset=reset, step=step, mirror=mirror_of(batch)
     )
+
+
+def with_truth(shape: Any) -> dict[str, tuple[int, ...]]:
+    """Shapes by name of what a learner sees, and of TRUTH."""
+    return {**(shape if isinstance(shape, dict) else {"camera": shape}), TRUTH: (privileged.SIZE,)}
 
 
 def obs_shape_of(env: Env) -> Any:
@@ -429,19 +431,23 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
     return tuple(found)
 
 
-def dreamer_policy(preset: Preset, control_dt: float) -> tuple[Step, dict[str, Any]]:
-    """The agent as the step of one instance, limits included, and its first carry."""
+def dreamer_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
+    """The agent as the step of one instance, limits included, and its first carry; for what `env` shows."""
     learner, seconds = preset.learner, control_dt * preset.task.action_repeat
     step: Step = lambda params, carry, image: agents.policy_step(learner, params, carry, image)  # noqa: E731
     carry = agents.policy_carry(learner, 2)
-    if preset.looks == "rich" and TRUTH in learner.decode_only:
-        believe = lambda params, carry: privileged.UNIT * agents.believed(params, carry)[:4]  # noqa: E731
+    if env.rich and TRUTH in learner.decode_only:
+        shape = with_truth(obs_shape_of(env))
+
+        def believe(params: Any, carry: Any) -> jax.Array:
+            return privileged.UNIT * agents.believed(params, carry, shape, TRUTH)[..., :4]
+
         step, carry = watched(step, carry, seconds, believe)
     return limited_policy(preset.task, preset.safety, step, carry, seconds)
 
 
 def ppo_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
-    """The same of the model-free baseline, for what `env` shows."""
+    """The same of the model-free baseline."""
     return limited_policy(
         preset.task, preset.safety, lambda params, carry, image: ppo.policy_step(preset.ppo, params, carry, image),
         ppo.policy_carry(preset.ppo, obs_shape_of(env)), control_dt * preset.task.action_repeat,
