@@ -124,16 +124,20 @@ def load(path: str | Path, driver: str) -> Any:
     """The policy of a file, to be driven as `driver` says.
 
     Raises:
-        ValueError: the plant cannot keep its rate, or it has no limits to be stopped by.
+        ValueError: it needs more than an image or another rate than the plant's, or has no limits to be stopped by.
     """
-    from bridge.policy import Policy
+    from bridge.policy import AgentContract, Policy
 
     policy = Policy.load(path)
-    rate, needed = policy.contract.rate_hz, 1.0 / PERIOD
+    contract, needed = policy.contract, 1.0 / PERIOD
+    if isinstance(contract, AgentContract):
+        raise ValueError(f"{path}/policy.json: observes {', '.join(sorted(contract.sensors))}; this room shows one "
+                         "camera image alone. Drive a policy of that.")
+    rate = contract.rate_hz
     if abs(rate - needed) > 1e-6:
         raise ValueError(f"{path}/policy.json: rate_hz is {rate:g}; the plant takes {needed:g} commands a second. "
                          "Export the policy with that rate.")
-    if driver == WITH_STOP and policy.contract.novelty is None:
+    if driver == WITH_STOP and contract.novelty is None:
         raise ValueError(f"{path}/policy.json: has no novelty, the limits of --with-stop. Leave the option out, or "
                          "train with the preset transfer.")
     return policy

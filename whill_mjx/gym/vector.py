@@ -164,8 +164,9 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
             self._randoms = [gymnasium.utils.seeding.np_random(None)[0] for _ in range(count)]
         numbers = np.zeros(count, np.uint32)
         for index in range(count) if mask is None else np.flatnonzero(mask):
-            if seeds[index] is not None:
-                self._randoms[index] = gymnasium.utils.seeding.np_random(int(seeds[index]))[0]
+            one = seeds[index]
+            if one is not None:
+                self._randoms[index] = gymnasium.utils.seeding.np_random(int(one))[0]
             numbers[index] = self._randoms[index].integers(2**31)
         return jax.vmap(jax.random.key)(numbers)
 
