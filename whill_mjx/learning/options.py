@@ -115,7 +115,7 @@ def choose_preset(options: TrainOptions) -> Preset:
     preset = find_preset(name, task, options.steps)
     preset = dataclasses.replace(preset, task=dataclasses.replace(preset.task, **read_fields(task, options.set)))
     _check_twice(options)
-    preset = with_layout(preset, options.layout, options.looks)
+    preset = with_layout(preset, options.layout, options.looks, options.vehicle)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
     learner, baseline = preset.learner, preset.ppo

@@ -180,14 +180,14 @@ def _changed(holder: Any, changes: Mapping[str, Any], where: str) -> Any:
     return dataclasses.replace(holder, **changes)
 
 
-def with_layout(preset: Preset, layout: str, looks: str | None = None) -> Preset:
-    """The same training in worlds of this layout and these looks; None keeps the preset's looks.
+def with_layout(preset: Preset, layout: str, looks: str | None = None, vehicle: str | Path | None = None) -> Preset:
+    """The same training of a vehicle in worlds of this layout and these looks; None keeps the preset's looks.
 
     The mirror shows no more other worlds than there are.
     """
     task = dataclasses.replace(preset.task, layout=layout)  # an unknown one is refused here
     looks = preset.looks if looks is None else looks
-    worlds = min(preset.learner.mirror, mirror_worlds(make_env(task, looks=looks)[0]))
+    worlds = min(preset.learner.mirror, mirror_worlds(make_env(task, vehicle, looks=looks)[0]))
     learner = dataclasses.replace(preset.learner, mirror=worlds)
     return dataclasses.replace(preset, task=task, looks=looks, learner=learner)
 
