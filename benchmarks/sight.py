@@ -46,8 +46,6 @@ class Options:
     """Files that `benchmarks.foreign` wrote."""
     runs: tuple[str, ...] = ()
     """Folders of trainings."""
-    stops: tuple[str, ...] = ()
-    """NAME=NAT: surprise at which a policy stops for good; the same drives are counted once more with that stop."""
     device: str = ""
     """Device on which those drives or trainings ran; none says this one."""
 
@@ -121,14 +119,9 @@ def steps(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
 def foreign(options: Options) -> dict[str, dict[str, Any]]:
     """Shares of arrivals and collisions of every policy, driver and variant; the transfer policies' medians."""
     drives = [one for path in options.drives for one in json.loads(path.read_text())["drives"]]
-    stops = {name: float(nat) for name, nat in (text.split("=", 1) for text in options.stops)}
     groups: dict[tuple[str, str, str], list[str]] = {}
     for one in drives:
         groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
-        if one["driver"] == "policy" and one["policy"] in stops:
-            surprised = max(one["novelty"], default=0.0) >= stops[one["policy"]]
-            end = "stopped" if surprised else one["end"]
-            groups.setdefault((one["policy"], "with_stop", one["variant"]), []).append(end)
     found: dict[str, dict[str, Any]] = {}
     seeds: dict[tuple[str, str, str], list[float]] = {}
     device = options.device or device_name()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -144,10 +145,17 @@ def policy_step(config: DreamerConfig, params: Params, carry: Carry, obs: Any) -
     return {name: value[0] for name, value in new_carry.items()}, action[0]
 
 
-def believed(params: Params, carry: Carry) -> jax.Array:
-    """Vectors (..., D) of `decode_only`, as they are predicted from the carry of one instance or of several."""
+def believed(params: Params, carry: Carry, obs_shape: Mapping[str, spaces.Shape], name: str) -> jax.Array:
+    """Vector (..., D) of a name, as it is predicted from the carry of one instance or of several.
+
+    Args:
+        params: of the agent.
+        carry: of `policy_step`.
+        obs_shape: shapes of all that is observed in training, targets of the decoder among them.
+        name: of the vector.
+    """
     features = jnp.concatenate([carry["deter"], carry["stoch"]], -1)
-    return dist.symexp(sensors.decode_vector(params["dec"], features))
+    return dist.symexp(sensors.decode_vector(params["dec"], features)[..., spaces.place_of(obs_shape, name)])
 
 
 def policy_carry(config: DreamerConfig, action_dim: ActionSpec) -> Carry:

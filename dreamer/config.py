@@ -10,6 +10,8 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+LEAST_TRAIN_RATIO = 0.001
+"""Replayed steps are credited in fractions whose denominator is at most its inverse."""
 RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("deter", "hidden", "units", "stoch", "blocks", "depth", "patch", "patch_units", "bins",
                      "batch_size", "imag_horizon", "steps_per_iter"), (1, 1e6)),
@@ -20,7 +22,8 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("greedy_share", "unimix", "return_lambda", "slow_rate", "return_norm_rate", "average_rate",
                      "beta1", "beta2", "lr"), (0, 1)),
     **dict.fromkeys(("min_std", "max_std"), (0, 100)),
-    **dict.fromkeys(("noise_steps", "horizon", "imag_last", "train_ratio"), (0, 1e6)),
+    **dict.fromkeys(("noise_steps", "horizon", "imag_last"), (0, 1e6)),
+    "train_ratio": (LEAST_TRAIN_RATIO, 1e6),
     **dict.fromkeys(("mean_pull", "policy_outscale", "entropy_scale", "slow_reg", "replay_value_scale", "barlow_scale",
                      "barlow_redundancy", "dyn_scale", "rep_scale", "recon_scale", "vector_scale", "reward_scale",
                      "continue_scale", "free_nats", "behavior_lr", "agc", "agc_min_norm", "eps"), (0, 1e12)),
@@ -199,7 +202,7 @@ class DreamerConfig:
             ok = isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
             kind = "must be a whole number" if whole else "must be a number"
             self._require(ok and low <= value <= high, name, f"{kind} in {low:g}..{high:g}")
-        for name in ("lr", "behavior_lr", "horizon", "min_std", "max_std", "train_ratio"):
+        for name in ("lr", "behavior_lr", "horizon", "min_std", "max_std"):
             self._require(getattr(self, name) > 0, name, "must be positive")
         rules = (
             (self.deter % self.blocks == 0, "deter", f"must be divisible by blocks ({self.blocks})"),

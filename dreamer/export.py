@@ -212,8 +212,8 @@ def export_sensing(
 ) -> Path:
     """Write the policy of a vehicle that observes other sensors than its camera alone, and return its folder.
 
-    It is an agent (`export_agent`) whose actions are commands: the contract's limits, rate and action repeat are in the
-    file too, and so are its sensors, which the bridge must know to drive by it.
+    It is an agent (`export_agent`) whose actions are commands: the contract's limits, rate, action repeat and novelty
+    are in the file too, and so are its sensors, which the bridge must know to drive by it.
 
     Args:
         path: folder to write; an existing policy file there is replaced as a whole.
@@ -241,6 +241,7 @@ def export_sensing(
         "action": {"kind": "box", "size": 2, **vehicle["action"]},
         **{name: vehicle[name] for name in ("rate_hz", "action_repeat", "task")},
         **({"sensors": {name: dict(one) for name, one in sorted(policy.sensors.items())}} if policy.sensors else {}),
+        **({"novelty": vehicle["novelty"]} if "novelty" in vehicle else {}),
     }
     return _write_agent(path, converted, policy.weights, table, vehicle_file)
 

@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 from dreamer import agent as agents
 from dreamer import exploration, parallel, replay, sensors, spaces
 from dreamer.agent import AgentState
-from dreamer.config import DreamerConfig
+from dreamer.config import LEAST_TRAIN_RATIO, DreamerConfig
 from dreamer.host_replay import HostFrames
 from dreamer.replay import Batch, Replay
 from dreamer.rssm import Latent
@@ -62,12 +62,8 @@ class TrainState:
     """(N, A) of the actions; None where it has no memory."""
 
 
-def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array) -> TrainState:
-    """State before the first step.
-
-    Raises:
-        ValueError: observation, action, replay or pretraining do not fit, or there is no mirror.
-    """
+def check_fit(env: FunctionalEnv, config: DreamerConfig) -> None:
+    """Raise ValueError where observation, mirror or pretraining do not fit; nothing is computed."""
     worlds = 0 if env.mirror is None else env.mirror.worlds
     if config.mirror > worlds:
         raise ValueError(
@@ -82,6 +78,15 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
             f"than batch_length ({config.batch_length}) steps to learn from. Raise it above {needed}, or set it and "
             "pretrain_updates to 0."
         )
+
+
+def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array) -> TrainState:
+    """State before the first step.
+
+    Raises:
+        ValueError: observation, action, replay or pretraining do not fit, or there is no mirror.
+    """
+    check_fit(env, config)
     zero = jnp.zeros((), jnp.int32)
     agent_key, env_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state, transition = env.reset(env_key)
@@ -248,7 +253,7 @@ def sum_over(
 
 def credit_rates(config: DreamerConfig, num_envs: int) -> tuple[int, int]:
     """Credit earned by one step of all instances, and the price of one update, as whole numbers."""
-    ratio = Fraction(config.train_ratio).limit_denominator(1000)
+    ratio = Fraction(config.train_ratio).limit_denominator(round(1 / LEAST_TRAIN_RATIO))
     return num_envs * ratio.numerator, config.replayed_per_update * ratio.denominator
 
 

@@ -67,6 +67,12 @@ def vector_of(obs: Any) -> jax.Array | None:
     return (vectors[0] if len(vectors) == 1 else jnp.concatenate(vectors, -1)) if vectors else None
 
 
+def place_of(obs_shape: Mapping[str, Shape], name: str) -> slice:
+    """Where the vector of a name lies among all vectors joined."""
+    first = sum(shape[0] for other, shape in obs_shape.items() if len(shape) == 1 and other < name)
+    return slice(first, first + obs_shape[name][0])
+
+
 def zeros(obs_shape: ObsShape, batch: Shape = ()) -> Any:
     """A black and silent observation with leading axes `batch`."""
 

@@ -39,7 +39,12 @@ class BatchState:
     env: State  # leaves (N, ...)
     params: VehicleParams  # leaves (N, ...): each instance has its own vehicle
     origin: jax.Array  # (N,) random key from which world, vehicle and start of the episode were drawn
-    tries: jax.Array  # (N,) int32: how often the episode's world was begun again
+    tries: jax.Array  # (N,) int32: how often the episode's world was begun again; ~ that after a success
+
+    @property
+    def begun_again(self) -> jax.Array:
+        """(N,) int32: how often the episode's world was begun again."""
+        return jnp.where(self.tries < 0, ~self.tries, self.tries)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +61,7 @@ class BatchEnv:
     devices: tuple = ()
     """Devices over which the instances are split evenly; none leaves the placement to JAX."""
     second_tries: float = 0.0
-    """Share of the episodes without an arrival after which the same world is begun again, with the same vehicle and
+    """Share of the episodes without success after which the same world is begun again, with the same vehicle and
     start; for training. What fails is met more often so (cf. prioritised level replay, Jiang et al. 2021)."""
 
     variations: tuple[Variation, ...] = ()
@@ -114,7 +119,7 @@ class BatchEnv:
         """
 
         def one(state: BatchState, number: jax.Array) -> jax.Array:
-            key = jax.random.fold_in(jax.random.fold_in(state.origin, number), state.tries)
+            key = jax.random.fold_in(jax.random.fold_in(state.origin, number), state.begun_again)
             return observe(self.env, repainted(self.env, state.env, key))
 
         numbers = jnp.arange(1, worlds + 1)
@@ -148,18 +153,24 @@ class BatchEnv:
 
     def _again(self, state: BatchState) -> tuple[jax.Array, jax.Array]:
         """Key with which the next episode of an instance begins, and how often its world was begun before."""
-        chance = jax.random.uniform(jax.random.fold_in(state.env.key, state.tries))
-        again = (state.env.goal_distance > self.env.task.goal_radius) & (chance < self.second_tries)
+        chance = jax.random.uniform(jax.random.fold_in(state.env.key, state.begun_again))
+        again = (state.tries >= 0) & (chance < self.second_tries)
         return jnp.where(again, state.origin, state.env.key), jnp.where(again, state.tries + 1, 0)
 
     def _advance(self, state: BatchState, action: jax.Array) -> tuple[BatchState, Outcome, jax.Array]:
         ended = state.env.done
-        after, outcome = step_state(self.env, state.params, state.env, action)
         chosen, outcome = jax.tree.map(
-            lambda new, old: jnp.where(ended, new, old),
-            self._anew(state), (dataclasses.replace(state, env=after), outcome),
-        )  # fmt: skip
+            lambda new, old: jnp.where(ended, new, old), self._anew(state), self._go_on(state, action)
+        )
         return chosen, outcome, ended
+
+    def _go_on(self, state: BatchState, action: jax.Array) -> tuple[BatchState, Outcome]:
+        after, outcome = step_state(self.env, state.params, state.env, action)
+        state = dataclasses.replace(state, env=after)
+        if self.second_tries:
+            succeeded = outcome.metrics["success"] > 0
+            state = dataclasses.replace(state, tries=jnp.where(succeeded, ~state.tries, state.tries))
+        return state, outcome
 
     def _anew(self, state: BatchState) -> tuple[BatchState, Outcome]:
         return self._begin(*(self._again(state) if self.second_tries else (state.env.key,)))
@@ -167,7 +178,7 @@ class BatchEnv:
     def _advance_few(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, Outcome, jax.Array]:
         """The same for all instances; worlds are drawn for those alone that have ended, `FEW` at a time."""
         ended, count = state.env.done, actions.shape[0]
-        after, outcome = jax.vmap(lambda one, action: step_state(self.env, one.params, one.env, action))(state, actions)
+        first = jax.vmap(self._go_on)(state, actions)
         order = jnp.pad(jnp.argsort(~ended, stable=True), (0, FEW))
         place = jnp.cumsum(ended) - 1  # of an instance that has ended, among these
 
@@ -181,7 +192,6 @@ class BatchEnv:
 
             return jax.tree.map(pick, begun, old)
 
-        first = (dataclasses.replace(state, env=after), outcome)
         return (*jax.lax.fori_loop(0, -(-ended.sum() // FEW), some, first), ended)
 
     def _split(self, function: Callable[..., Any]) -> Callable[..., Any]:

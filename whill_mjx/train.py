@@ -24,6 +24,7 @@ if starts(__name__):
 import jax
 
 from dreamer import checkpoint, parallel
+from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices, join
 from whill_mjx.env import make_env
 from whill_mjx.io.fields import percent
@@ -33,8 +34,7 @@ from whill_mjx.learning.index_page import list_results, write_index
 from whill_mjx.learning.memory import check_memory
 from whill_mjx.learning.options import TrainOptions, choose_preset, preset_name
 from whill_mjx.learning.outcome import evaluate_policy, export
-from whill_mjx.learning.ppo import check_minibatches
-from whill_mjx.learning.setup import Preset, variations_of
+from whill_mjx.learning.setup import Preset, check_learner, variations_of
 from whill_mjx.learning.trainings import Stage, best_params, train_baseline, train_policy
 from whill_mjx.logs.dataset import plain, write_json
 from whill_mjx.tasks.check import check_world
@@ -72,9 +72,10 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         from sysid import load_any
 
         load_any(options.log)
-    env, _ = make_env(preset.task, options.vehicle)
+    env, params = make_env(preset.task, options.vehicle, looks=preset.looks)
     check_world(env.task)  # of this vehicle, which a map may not have room for
     check_memory(preset, options.learner, env)
+    check_learner(preset, options.learner, make_batch(env, params, preset.instances))
     if any(text != "fit" for text in preset.vary):
         variations_of([text for text in preset.vary if text != "fit"], None)
     if "fit" in preset.vary and options.vehicle is not None:
@@ -82,9 +83,7 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
     if processes > 1 and options.learner == "ppo":
         raise ValueError("the baseline trains in one process; start it alone or choose --learner dreamer.")
     devices = choose_devices(options.devices)
-    if options.learner == "ppo":
-        check_minibatches(preset.ppo, preset.instances)
-    elif devices:
+    if devices and options.learner == "dreamer":
         parallel.make_mesh(devices, preset.instances, preset.learner.batch_size)
     if options.tensorboard:
         try:

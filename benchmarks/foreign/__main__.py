@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from benchmarks.foreign.drivers import CONTROLS
+from benchmarks.foreign.drivers import CONTROLS, WITH_STOP, load
 from benchmarks.foreign.room import VARIANTS
 from benchmarks.foreign.run import Job, drive_all
 from bridge.options import Parser, whole
@@ -21,6 +21,7 @@ def main() -> None:
     parser = Parser(prog="python -m benchmarks.foreign", description=__doc__)
     parser.add_argument("--policy", nargs="*", default=[], metavar="NAME=FOLDER", help="policy files")
     parser.add_argument("--controls", nargs="*", default=[], choices=CONTROLS, help="of the first policy")
+    parser.add_argument("--with-stop", action="store_true", help="drive each policy with the limits of its file too")
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=VARIANTS)
     parser.add_argument("--drives", type=whole(), default=200, help="of each policy in each variant")
     parser.add_argument("--first-seed", type=whole(0), default=5000)
@@ -28,10 +29,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("foreign.json"))
     options = parser.parse_args()
     named = [text.split("=", 1) for text in options.policy]
+    drivers = ["policy", *([WITH_STOP] if options.with_stop else [])]
+    for _, source in named:
+        load(source, drivers[-1])  # what cannot be driven is refused before anything is
     jobs: list[Job] = []
     for variant in options.variants:
         for seed in range(options.first_seed, options.first_seed + options.drives):
-            jobs += [(variant, seed, name, source, "policy") for name, source in named]
+            jobs += [(variant, seed, name, source, driver) for name, source in named for driver in drivers]
             for control in options.controls:
                 sighted = control in ("blank", "frozen")
                 name, source = named[0] if sighted else (control, "")
@@ -48,7 +52,8 @@ def table(results: list[dict[str, Any]]) -> list[str]:
         groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
     lines = []
     for (policy, driver, variant), ends in sorted(groups.items()):
-        shares = ", ".join(f"{end} {ends.count(end) / len(ends):.1%}" for end in ("arrived", "collided", "timeout"))
+        known = ("arrived", "collided", "timeout", *(["stopped"] if driver == WITH_STOP else []))
+        shares = ", ".join(f"{end} {ends.count(end) / len(ends):.1%}" for end in known)
         lines.append(f"{policy:12s} {driver:9s} {variant:10s} {len(ends):4d} drives: {shares}")
     return lines
 

@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.foreign.drive import Pose
+from benchmarks.foreign.drive import PERIOD, Pose
 from benchmarks.foreign.room import AHEAD, BEGIN, END, GOAL, WIDTH, Room
+from bridge.safety import SafetyConfig
 
 CONTROLS = ("planner", "straight", "blank", "frozen")
 """A planner that knows the truth, straight ahead, and the policy with black images or its first one kept."""
+WITH_STOP = "with_stop"
+"""The policy, slowed down and stopped by its surprise, as the bridge does."""
 SPEED, TURN = 0.3, 0.6  # m/s, rad/s
 RADIUS = 0.32
 """Of the circles that hold the chair in the planner's search [m]."""
@@ -78,26 +81,63 @@ class Planner:
 
 
 class Sighted:
-    """A policy file, with the images as they are, blank, or the first one kept."""
+    """A policy file, with the images as they are, blank, or the first one kept; each decision is held as long as in
+    training."""
 
-    def __init__(self, policy: Any, see: str = "policy") -> None:
-        self.policy, self.see = policy, see
+    def __init__(self, policy: Any, driver: str) -> None:
+        self.policy, self.driver = policy, driver
+        self.limits: tuple[float, float] | None = policy.contract.novelty if driver == WITH_STOP else None
         self.first: np.ndarray | None = None
+        self.held, self.periods = (0.0, 0.0), 0
+        self.stopped = False
         policy.reset()
 
+    @property
+    def looks(self) -> bool:
+        """Whether the next command needs a new image."""
+        decides = self.periods % self.policy.contract.action_repeat == 0
+        return decides and not self.stopped and (self.driver in ("policy", WITH_STOP) or self.periods == 0)
+
     def command(self, image: np.ndarray) -> tuple[float, float]:
-        """v [m/s], omega [rad/s]."""
-        if self.see == "blank":
+        """v [m/s], omega [rad/s] of one period; zeros for good after the surprise has reached the second limit."""
+        if self.periods % self.policy.contract.action_repeat == 0 and not self.stopped:
+            self.held = self._decide(image)
+        self.periods += 1
+        return self.held
+
+    def _decide(self, image: np.ndarray) -> tuple[float, float]:
+        if self.driver == "blank":
             image = np.zeros_like(image)
-        elif self.see == "frozen":
+        elif self.driver == "frozen":
             self.first = image if self.first is None else self.first
             image = self.first
         v, omega = self.policy.step(image)
-        return float(v), float(omega)
+        share = 1.0
+        if self.limits is not None:
+            slow, stop = self.limits
+            self.stopped = self.policy.novelty >= stop
+            share = 0.0 if self.stopped else SafetyConfig.slow_factor if self.policy.novelty >= slow else 1.0
+        return share * float(v), share * float(omega)
 
 
-def load(path: str | Path) -> Any:
-    """The policy of a file."""
-    from bridge.policy import Policy
+def load(path: str | Path, driver: str) -> Any:
+    """The policy of a file, to be driven as `driver` says.
 
-    return Policy.load(path)
+    Raises:
+        ValueError: it needs more than an image or another rate than the plant's, or has no limits to be stopped by.
+    """
+    from bridge.policy import AgentContract, Policy
+
+    policy = Policy.load(path)
+    contract, needed = policy.contract, 1.0 / PERIOD
+    if isinstance(contract, AgentContract):
+        raise ValueError(f"{path}/policy.json: observes {', '.join(sorted(contract.sensors))}; this room shows one "
+                         "camera image alone. Drive a policy of that.")
+    rate = contract.rate_hz
+    if abs(rate - needed) > 1e-6:
+        raise ValueError(f"{path}/policy.json: rate_hz is {rate:g}; the plant takes {needed:g} commands a second. "
+                         "Export the policy with that rate.")
+    if driver == WITH_STOP and contract.novelty is None:
+        raise ValueError(f"{path}/policy.json: has no novelty, the limits of --with-stop. Leave the option out, or "
+                         "train with the preset transfer.")
+    return policy

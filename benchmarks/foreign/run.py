@@ -25,19 +25,23 @@ MOUNT = {"x": 0.532, "y": 0.0, "z": 0.682, "roll": 0.0, "pitch": 0.15, "yaw": 0.
 
 
 def drive(variant: str, seed: int, driver: str, policy: Any = None, frames: list | None = None) -> dict[str, Any]:
-    """One drive: how it ended, after how many commands, and what was seen, if `frames` is a list."""
+    """One drive: how it ended, after how many commands, and what was seen, if `frames` is a list.
+
+    It ends as "stopped" where the policy stopped for good, and nothing was reached or touched after that.
+    """
     room = make_room(variant, seed)
     random = np.random.default_rng([seed, 13])
     plant = SteppedPlant(Chair().on_day(random), room.start, random)
     mount = MOUNT if policy is None else dict(policy.contract.camera)
     camera = Camera(room.model, mount, variant == "plain", np.random.default_rng([seed, 14, VARIANTS.index(variant)]))
     planner = Planner(room) if driver == "planner" else None
-    sighted = None if policy is None else Sighted(policy, driver if driver in ("blank", "frozen") else "policy")
+    sighted = None if policy is None else Sighted(policy, driver)
     size = 64 if policy is None else policy.contract.height
     novelty: list[float] = []
     end, steps, image = "timeout", 0, np.zeros((size, size, 3), np.uint8)
     try:
-        for steps in range(1, STEPS + 1):
+        while steps < STEPS:
+            steps += 1
             pose = plant.pose()
             camera.place(pose)
             if camera.touches():
@@ -46,8 +50,7 @@ def drive(variant: str, seed: int, driver: str, policy: Any = None, frames: list
             if (pose.x - GOAL[0]) ** 2 + (pose.y - GOAL[1]) ** 2 <= 1.0:
                 end = "arrived"
                 break
-            looks = driver == "policy" or (driver == "frozen" and steps == 1)
-            if frames is not None or looks:
+            if frames is not None or (sighted is not None and sighted.looks):
                 image = camera.image(size)
                 if frames is not None:
                     frames.append(image)
@@ -59,6 +62,8 @@ def drive(variant: str, seed: int, driver: str, policy: Any = None, frames: list
             else:
                 command = (0.3, 0.0)
             plant.drive_period(*command)
+        if end == "timeout" and sighted is not None and sighted.stopped:
+            end = "stopped"
     finally:
         camera.close()
     return {"variant": variant, "seed": seed, "driver": driver, "end": end, "steps": steps, "novelty": novelty}
@@ -74,7 +79,7 @@ Job = tuple[str, int, str, str, str]
 def _job(job: Job) -> dict[str, Any]:
     variant, seed, name, source, driver = job
     if source and source not in _POLICIES:
-        _POLICIES[source] = load(source)
+        _POLICIES[source] = load(source, driver)
     policy = _POLICIES.get(source)
     return {**drive(variant, seed, driver, policy), "policy": name}
 

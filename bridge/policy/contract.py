@@ -124,8 +124,8 @@ class AgentContract:
     """Of an agent that drives a vehicle by other sensors than its camera alone."""
     sensors: Mapping[str, SensorInput] = field(default_factory=dict)
     """Of the observations by name; empty where the file does not say what measures them."""
-    novelty: None = None
-    """An agent's file has no score of its surroundings."""
+    novelty: tuple[float, float] | None = None
+    """Surprise [m] from which the vehicle slows down, and at which it stops; None where the file has no score."""
 
     SINGLE = "observation"
 
@@ -230,6 +230,7 @@ def parse_agent(name: str, table: Mapping[str, Any]) -> AgentContract:
         task=fields.rule("task", lambda value: isinstance(value, str), "must be text") if "task" in table else "",
         commands=_parse_commands(fields, action) if "low" in action.table and size == 2 and kind == "box" else None,
         sensors=parse_sensors(fields, observation if isinstance(observation, dict) else {seen[0]: observation}),
+        novelty=_parse_novelty(fields, carry),
     )
 
 

@@ -10,8 +10,10 @@ import pytest
 from dreamer_toys import tiny_config
 
 import dreamer.export
+from bridge.policy import Policy as Driver
+from bridge.policy import PolicyFileError
 from dreamer import agent, sensors
-from dreamer.export import export_agent
+from dreamer.export import PolicyContract, SensingPolicy, export_agent, export_sensing
 from dreamer.network import Network
 from dreamer.policy import Policy, of_agent
 from dreamer.spaces import Box, Discrete
@@ -131,3 +133,35 @@ def test_a_vehicle_refuses_an_agent_without_units_and_rates(exported):
 
     with pytest.raises(PolicyFileError, match="the agent drives no vehicle: its action has no low and high"):
         VehiclePolicy.load(exported[1])
+
+
+def test_what_is_believed_of_a_vector_is_found_by_its_name_among_all():
+    """The decoder predicts all vectors, those before in the alphabet first."""
+    shape = {**SENSES, "world": (3,)}  # joined: bearing (1), speed (2), world (3)
+    params = params_of(AIDED, shape, Box(2))
+    out = params["dec"]["vector"]["out"]
+    params["dec"]["vector"]["out"] = {name: jax.numpy.zeros_like(leaf) for name, leaf in out.items()}
+    params["dec"]["vector"]["out"]["b"] = jax.numpy.log1p(jax.numpy.arange(6.0))
+    carry = agent.policy_carry(AIDED, Box(2))
+    for name, expected in (("bearing", [0.0]), ("speed", [1.0, 2.0]), ("world", [3.0, 4.0, 5.0])):
+        np.testing.assert_allclose(agent.believed(params, carry, shape, name), expected, atol=1e-5)
+
+
+def test_an_agent_that_drives_keeps_the_limits_of_its_surprise_and_false_ones_are_refused(tmp_path):
+    def step(carry, obs):
+        surprise = carry["surprise"] + obs["goal"][:1]
+        return {"surprise": surprise}, jax.numpy.clip(obs["goal"], -1.0, 1.0)
+
+    seen = {"camera": {"kind": "camera"}, "goal": {"kind": "goal"}}
+    policy = SensingPolicy(step, {"surprise": np.zeros(1, np.float32)}, {"camera": (8, 8, 3), "goal": (2,)}, {}, seen)
+    contract = PolicyContract((0.0, -0.6), (0.3, 0.6), novelty=(0.5, 1.5))
+    path = export_sensing(tmp_path / "policy", policy, contract)
+    driver = Driver.load(path)
+    driver.step({"camera": np.zeros((8, 8, 3), np.uint8), "goal": np.array([0.75, 0.0], np.float32)})
+    assert driver.contract.novelty == (0.5, 1.5) and driver.novelty == pytest.approx(0.75)
+    with pytest.raises(PolicyFileError, match="novelty.*two rising numbers"):
+        export_sensing(tmp_path / "falling", policy, dataclasses.replace(contract, novelty=(1.5, 0.5)))
+    blind = dataclasses.replace(policy, step=lambda carry, obs: ({}, obs["goal"]), carry={})
+    with pytest.raises(PolicyFileError, match="novelty.*beside a carry 'surprise'"):
+        export_sensing(tmp_path / "blind", blind, contract)
+    assert not (tmp_path / "falling").exists() and not (tmp_path / "blind").exists()

@@ -148,30 +148,43 @@ def test_instances_can_be_split_over_devices_and_uneven_splits_are_refused():
         make_batch(env, params, 3, devices=devices * 2)
 
 
-def test_a_share_of_the_failed_worlds_is_begun_again():
-    """The same world, vehicle and start; one that was arrived in, here each fourth, is never begun again."""
-    env, params = make_env(ObstacleCourse(max_steps=1), height=8, width=8)
-    many = make_batch(env, params, 32, spread=0.05, second_tries=0.5)
-    arrived = np.arange(32) % 4 == 0
+@dataclasses.dataclass(frozen=True)
+class Lot(ObstacleCourse):
+    """A success far from the goal in a fourth of the worlds, and none beside the goal, where each of them ends."""
+
+    max_steps: int = 1
+    goal_radius: float = 100.0
+
+    def endings(self, moment):
+        lot = 1e3 * jnp.sum(moment.scene.boxes.centre)
+        return {"success": lot - jnp.floor(lot) < 0.25}
+
+
+@pytest.mark.parametrize("count", [8, 32])  # one by one, and as a processor begins many
+def test_a_share_of_the_failed_worlds_is_begun_again(count):
+    """The same world, vehicle and start; one with a success, wherever it was, is never begun again."""
+    env, params = make_env(Lot(), height=8, width=8)
+    many = make_batch(env, params, count, spread=0.05, second_tries=0.5)
 
     def drive(key):
         state, _ = many.reset(key)
-        return jax.lax.scan(advance, (state, state), None, length=24)[1]
+        return jax.lax.scan(advance, (state, state), None, length=768 // count)[1]
 
     def advance(last_two, _):  # an episode has one step, at whose end time is up
         begun, ended = last_two
-        distance = jnp.where(arrived, 0.5 * env.task.goal_radius, ended.env.goal_distance)
-        ended = dataclasses.replace(ended, env=dataclasses.replace(ended.env, goal_distance=distance))
-        new, frame = many.step(ended, jnp.ones((32, 2)))
+        new, frame = many.step(ended, jnp.ones((count, 2)))
         same = [jax.vmap(lambda one, two: jnp.allclose(one, two, atol=1e-5))(a, b) for a, b in zip(
             jax.tree.leaves((begun.env.scene, begun.params, begun.env.vehicle.qpos)),
             jax.tree.leaves((new.env.scene, new.params, new.env.vehicle.qpos)), strict=True)]
-        return (ended, new), (jnp.all(jnp.stack(same), 0), jnp.all(frame.first), new.tries)
+        told = jnp.all(frame.first), frame.metrics["success"] > 0, new.tries
+        return (ended, new), (jnp.all(jnp.stack(same), 0), *told)
 
-    same, first, tries = (np.asarray(each)[1::2] for each in jax.jit(drive)(jax.random.key(2)))
+    same, first, success, tries = (np.asarray(each) for each in jax.jit(drive)(jax.random.key(2)))
+    same, first, arrived, tries = same[1::2], first[1::2], success[::2], tries[1::2]
     assert first.all()  # every second step begins episodes
-    assert not same[:, arrived].any() and 0.35 <= same[:, ~arrived].mean() <= 0.65
-    counted = np.zeros(32, int)
+    assert 0.1 < arrived.mean() < 0.5
+    assert not same[arrived].any() and 0.35 <= same[~arrived].mean() <= 0.65
+    counted = np.zeros(count, int)
     for row, told in zip(same, tries, strict=True):
         counted = np.where(row, counted + 1, 0)
         np.testing.assert_array_equal(told, counted)

@@ -1,9 +1,12 @@
 """The foreign corridor that transfer is measured in: the truth arrives, and who sees nothing does not."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.foreign.drivers import Sighted, load
 from benchmarks.foreign.room import GOAL, VARIANTS, WIDTH, make_room
 from benchmarks.foreign.run import drive
 
@@ -48,3 +51,65 @@ def test_lamps_and_their_lights_hang_at_the_ceiling(variant):
         glowing = model.geom_pos[model.mat_emission[model.geom_matid] * (model.geom_matid >= 0) > 0.5]
         assert len(placed) == len(glowing) == (0 if variant == "plain" else 3)
         assert np.all(np.concatenate([placed, glowing])[:, 2] > 2.0), f"seed {seed}"
+
+
+class Driven:
+    """A policy that drives ahead at 0.3 m/s, counts its decisions, and is surprised from one of them on."""
+
+    def __init__(self, repeat=1, novelty=(1.0, 2.0), surprise=lambda decisions: 0.0, rate_hz=10.0):
+        camera = {"x": 0.532, "y": 0.0, "z": 0.682, "roll": 0.0, "pitch": 0.15, "yaw": 0.0, "fov_y": 1.2}
+        self.contract = SimpleNamespace(camera=camera, height=8, action_repeat=repeat, rate_hz=rate_hz, novelty=novelty)
+        self.surprise, self.decisions = surprise, 0
+
+    def reset(self):
+        self.decisions = 0
+
+    def step(self, image):
+        self.decisions += 1
+        return np.array([0.3, 0.01 * self.decisions])
+
+    @property
+    def novelty(self):
+        return self.surprise(self.decisions)
+
+
+def test_a_decision_is_held_as_long_as_in_training():
+    policy = Driven(repeat=3)
+    sighted = Sighted(policy, "policy")
+    looked, turns = [], []
+    for _ in range(7):
+        looked.append(sighted.looks)
+        turns.append(sighted.command(np.zeros((8, 8, 3), np.uint8))[1])
+    assert policy.decisions == 3 and looked == [True, False, False] * 2 + [True]
+    assert turns == pytest.approx([0.01] * 3 + [0.02] * 3 + [0.03])
+
+
+def test_surprise_slows_down_and_then_stops_for_good_by_the_limits_of_the_file():
+    image = np.zeros((8, 8, 3), np.uint8)
+    swinging = Driven(surprise=lambda decisions: [0.5, 1.0, 0.5, 2.0, 0.0, 0.0][decisions - 1])
+    sighted = Sighted(swinging, "with_stop")
+    assert [sighted.command(image)[0] for _ in range(6)] == pytest.approx([0.3, 0.09, 0.3, 0.0, 0.0, 0.0])
+    assert sighted.stopped and swinging.decisions == 4
+    careless = Sighted(Driven(surprise=lambda decisions: 9.0), "policy")
+    assert careless.command(image)[0] == pytest.approx(0.3)
+
+
+def test_a_drive_ends_as_stopped_only_where_the_chair_came_to_a_stand_before_it_touched_anything(monkeypatch):
+    seed = next(seed for seed in range(5000, 5040) if abs(make_room("plain", seed).carton[1]) < 0.1)
+    black = np.zeros((8, 8, 3), np.uint8)
+    monkeypatch.setattr("benchmarks.foreign.camera.Camera.image", lambda self, size: black)
+    hit = drive("plain", seed, "policy", Driven())
+    assert hit["end"] == "collided"
+    early = drive("plain", seed, "with_stop", Driven(surprise=lambda decisions: 3.0 * (decisions > 5)))
+    late = drive("plain", seed, "with_stop", Driven(surprise=lambda decisions: 3.0 * (decisions >= hit["steps"] - 1)))
+    assert early["end"] == "stopped" and late["end"] == "collided"
+
+
+@pytest.mark.parametrize("driven, said", [
+    (Driven(rate_hz=5.0), "rate_hz is 5; the plant takes 10 commands a second"),
+    (Driven(novelty=None), "has no novelty"),
+])  # fmt: skip
+def test_a_policy_that_the_plant_cannot_drive_is_refused(driven, said, monkeypatch):
+    monkeypatch.setattr("bridge.policy.Policy.load", lambda path: driven)
+    with pytest.raises(ValueError, match=said):
+        load("mine", "with_stop")

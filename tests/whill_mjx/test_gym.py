@@ -150,6 +150,19 @@ def test_each_mode_begins_anew_as_gymnasium_defines_it(mode):
         many.reset(options={"reset_mask": np.array([True])})
 
 
+def test_a_seed_with_a_mask_leaves_the_random_numbers_of_the_other_instances():
+    """As Gymnasium's SyncVectorEnv, which resets those of the mask alone."""
+    some, none = (WhillVectorEnv(num_envs=2, **SMALL) for _ in range(2))
+    for many in (some, none):
+        many.reset(seed=0)
+    masked, _ = some.reset(seed=9, options={"reset_mask": np.array([True, False])})
+    afresh, _ = WhillVectorEnv(num_envs=2, **SMALL).reset(seed=9)
+    np.testing.assert_array_equal(masked[0], afresh[0])
+    (first, _), (second, _) = some.reset(), none.reset()
+    np.testing.assert_array_equal(first[1], second[1])
+    assert (first[0] != second[0]).any()
+
+
 def test_sensors_make_a_dict_and_its_spaces_hold_what_is_shown():
     env = WhillEnv(task=SHORT, observations=("goal", "lidar", "odometry", "commands"), render_mode="rgb_array",
                    height=8, width=8)  # fmt: skip

@@ -1,12 +1,17 @@
 """Surprise: beliefs that contradict one another raise it, and those of a vehicle that drives do not."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dreamer import agent as agents
+from dreamer.spaces import vector_size
 from whill_mjx.env import make_env
 from whill_mjx.evaluation.novelty import BELIEVED, RATE, SURPRISE, contradiction, largest_surprise, limits, watched
+from whill_mjx.learning.setup import TRUTH, dreamer_policy, find_preset, obs_shape_of, with_truth
 
 pytestmark = pytest.mark.quick
 SECONDS = 0.1
@@ -116,3 +121,22 @@ def _in_order(act, given, shapes):
     """Outputs of a step in the order of the file: the action, and the carry by name."""
     carry, action = act(None, dict(zip(shapes, given[1:], strict=True)), given[0])
     return [action, *(carry[name] for name in shapes)]
+
+
+def test_the_surprise_of_a_policy_with_several_sensors_is_of_the_goal_that_it_believes_in():
+    """Its decoder predicts the commands and the goal sensor first; beliefs are what it predicts of the truth."""
+    preset = find_preset("smoke", "corridor")
+    preset = dataclasses.replace(preset, learner=dataclasses.replace(preset.learner, decode_only=(TRUTH,)))
+    env, _ = make_env("corridor", looks="rich", height=16, width=16, observations=("camera", "commands", "goal"))
+    shape = with_truth(obs_shape_of(env))
+    params = agents.init_params(preset.learner, shape, 2, jax.random.key(0))
+    out = params["dec"]["vector"]["out"]
+    place = vector_size({name: one for name, one in shape.items() if name < TRUTH})
+    bias = jnp.zeros_like(out["b"]).at[place : place + 4].set(jnp.log1p(jnp.array([40.0, 10.0, 3.0, 2.0])))
+    params["dec"]["vector"]["out"] = {"w": jnp.zeros_like(out["w"]), "b": bias}
+    step, carry = dreamer_policy(preset, 0.1, env)
+    obs = {name: jnp.zeros(one, jnp.uint8 if len(one) == 3 else jnp.float32)
+           for name, one in shape.items() if name != TRUTH}  # fmt: skip
+    carry, _ = step(params, carry, obs)
+    assert place > 0
+    np.testing.assert_allclose(carry[BELIEVED], [4.0, 1.0, 0.3, 0.2], rtol=1e-4)

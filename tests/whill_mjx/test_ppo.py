@@ -15,10 +15,10 @@ from dreamer.train import TrainingOptions
 from whill_mjx.learning.ppo import (
     Network,
     PpoConfig,
-    ReturnScale,
     Rollout,
     advantages,
     empty_frames,
+    first_scale,
     init_state,
     iterate,
     policy_carry,
@@ -67,8 +67,7 @@ def test_advantages_by_hand():
 @pytest.mark.quick
 def test_rewards_are_scaled_by_the_spread_of_the_return():
     config = PpoConfig(discount=0.0)
-    zero = jnp.zeros(())
-    scale, rng, seen = ReturnScale(jnp.zeros(50), zero, zero, zero), np.random.default_rng(0), []
+    scale, rng, seen = first_scale(50), np.random.default_rng(0), []
     assert float(scale.std()) == 1.0
     for _ in range(20):
         rewards = rng.normal(2.0, 3.0, 50)
@@ -270,3 +269,14 @@ def test_the_exported_network_of_several_readings_drives_through_the_bridge_like
 def test_scans_of_several_lengths_are_refused():
     with pytest.raises(ValueError, match="one length"):
         empty_frames(SENSING, {"front": (16,), "rear": (20,)}, (1,))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("instances", [1, 16, 2048])
+@pytest.mark.parametrize("reward", [-0.05, 0.0, 1.0])
+def test_a_first_reward_that_all_instances_share_stays_a_number_of_ordinary_size(instances, reward):
+    """Variance of Gymnasium's NormalizeReward after one reward r: (1e-4 + r^2 1e-4 / 1.0001) / 1.0001."""
+    scale = track(PpoConfig(), first_scale(instances), jnp.full(instances, reward), jnp.zeros(instances, bool))
+    by_hand = np.sqrt((1e-4 + reward**2 * 1e-4 / 1.0001) / 1.0001 + 1e-8)
+    assert float(scale.std()) == pytest.approx(by_hand, rel=1e-3)
+    assert abs(reward) / float(scale.std()) < 100.0

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dreamer.iteration import credit_rates
 from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
@@ -383,13 +384,34 @@ def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("task, layout, worlds", [("corridor", "randomised", 3), ("corridor", "fixed", 1),
-                                                  ("obstacle_course", "randomised", 1)])  # fmt: skip
-def test_the_mirror_shows_no_more_worlds_than_there_are(task, layout, worlds):
-    preset = choose_preset(TrainOptions(preset="paper", task=task, layout=layout))
-    batch = make_evaluation_env(preset.task, "whill_cr_ramp", 1)
+@pytest.mark.parametrize("name, task, layout, looks, worlds", [
+    ("paper", "corridor", "randomised", None, 3), ("paper", "corridor", "fixed", None, 1),
+    ("paper", "obstacle_course", "randomised", None, 1), ("paper", "corridor", "randomised", "plain", 1),
+    ("transfer", "corridor", "randomised", None, 7), ("transfer", "corridor", "randomised", "plain", 1),
+    ("transfer", "obstacle_course", "randomised", "plain", 1), ("paper", "corridor", "fixed", "rich", 3),
+])  # fmt: skip
+def test_the_mirror_shows_no_more_worlds_than_there_are(name, task, layout, looks, worlds):
+    options = TrainOptions(preset=name, task=task, layout=layout, looks=looks)
+    preset = choose_preset(options)
+    batch = make_evaluation_env(preset.task, "whill_cr_ramp", 1, preset.looks)
     assert preset.learner.mirror == worlds <= functional_env(batch).mirror.worlds
-    assert preset.task.layout == layout
+    assert preset.task.layout == layout and preset.looks == (looks or ("rich" if name == "transfer" else None))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("options, said", [
+    (TrainOptions(preset="paper", task="corridor", looks="plain", change=("mirror=3",)), "mirror = 3.* than 1 other"),
+    (TrainOptions(preset="smoke", task="corridor", looks="rich", change=("mirror=16",)), "mirror = 16.* than 15 other"),
+    (TrainOptions(preset="smoke", task="corridor", change=('decode_only=["odour"]',)), "shows no odour"),
+    (TrainOptions(preset="smoke", change=("pretrain_steps=20", "pretrain_updates=2")), "pretrain_steps = 20"),
+    (TrainOptions(preset="smoke", learner="ppo", change=("minibatches=7",)), "do not split into 7 minibatches"),
+    (TrainOptions(preset="smoke", task="map_goal", looks="rich", steps=10), "no lane of three walls"),
+])  # fmt: skip
+def test_what_no_environment_of_the_training_has_is_refused_before_anything_is_written(options, said, tmp_path):
+    out = tmp_path / "run"
+    with pytest.raises(OptionError, match=said):
+        main(dataclasses.replace(options, out=out))
+    assert not out.exists()
 
 
 @pytest.mark.quick
@@ -397,6 +419,21 @@ def test_the_falling_rate_spans_the_run_whatever_its_train_ratio():
     for ratio in (256.0, 512.0, 1024.0):
         learner = choose_preset(TrainOptions(preset="paper", train_ratio=ratio)).learner
         assert learner.lr_decay == 22_000 * ratio / (learner.batch_size * learner.batch_length)
+        changed = choose_preset(TrainOptions(preset="paper", change=(f"train_ratio={ratio}",))).learner
+        assert changed == learner
+    half = choose_preset(TrainOptions(preset="paper", change=("batch_size=16",))).learner
+    assert half.lr_decay == 2 * choose_preset(TrainOptions(preset="paper")).learner.lr_decay
+    given = choose_preset(TrainOptions(preset="paper", change=("train_ratio=40", "lr_decay=5000"))).learner
+    assert given.lr_decay == 5000
+
+
+@pytest.mark.quick
+def test_a_train_ratio_that_would_never_update_is_refused():
+    least = choose_preset(TrainOptions(preset="cpu", train_ratio=0.001)).learner
+    assert credit_rates(least, 1) == (1, 1000 * least.replayed_per_update)
+    for asked in ({"train_ratio": 4e-4}, {"change": ("train_ratio=4e-4",)}):
+        with pytest.raises(ValueError, match=r"train_ratio = 0\.0004: it must be a number in 0\.001\.\."):
+            choose_preset(TrainOptions(preset="cpu", **asked))
 
 
 @pytest.mark.parametrize("learner", ["dreamer", "ppo"])
@@ -426,7 +463,8 @@ def test_only_training_episodes_begin_anywhere(learner, tmp_path, monkeypatch):
                            second_tries=0.25, learner=learner)
     with pytest.raises(Enough):
         main(options)
-    assert shares == [0.5, 0.0] and tries[:2] == [0.25, 0.0]
+    assert shares == [0.0, 0.5, 0.0]  # the preset's look at its worlds, the training, the evaluations inside it
+    assert tries[:2] == [0.25, 0.0]
 
 
 @pytest.mark.quick
@@ -466,9 +504,34 @@ def test_a_longer_hold_keeps_the_budget_in_control_periods(name, factor):
     updates = [one.total_steps * one.learner.train_ratio / one.learner.replayed_per_update for one in (short, long)]
     assert updates[1] == pytest.approx(updates[0], rel=0.05)
     assert long.learner.learning_starts * factor == pytest.approx(short.learner.learning_starts, abs=factor)
+    assert long.ppo.discount == pytest.approx(short.ppo.discount**factor)
+    iterations = [one.total_steps / (one.instances * one.ppo.rollout) for one in (short, long)]
+    assert iterations[1] == pytest.approx(iterations[0]) and long.ppo.minibatches == short.ppo.minibatches
 
 
 @pytest.mark.quick
 def test_a_decision_must_hold():
     with pytest.raises(ValueError, match="action_repeat is 0"):
         with_repeat(find_preset("paper", "obstacle_course"), 0)
+
+
+def test_figures_and_limits_of_a_policy_are_computed_with_all_bits(monkeypatch):
+    """As the vehicle's runtime does: a GPU would round the factors of a product to TF32."""
+    from whill_mjx.evaluation.novelty import SURPRISE
+    from whill_mjx.learning import outcome
+
+    class Computed(Exception):
+        pass
+
+    def compute(*args):
+        raise Computed(jax.config.jax_default_matmul_precision)
+
+    options = TrainOptions(preset="smoke", planner=False)
+    preset, result = choose_preset(options), Trained({}, 0, 0, 0.0)
+    monkeypatch.setattr(outcome, "policy_of", lambda *args: (None, {SURPRISE: jnp.zeros(1)}))
+    monkeypatch.setattr(outcome, "evaluate_drivers", compute)
+    monkeypatch.setattr(outcome, "largest_surprise", compute)
+    with pytest.raises(Computed, match="highest"):
+        outcome.evaluate_policy(options, preset, "whill_cr_ramp", result)
+    with pytest.raises(Computed, match="highest"):
+        outcome.export(options, preset, "whill_cr_ramp", result, Path("policy"))

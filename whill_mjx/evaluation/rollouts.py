@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.env import Env, State, end_names, observe, reset_state, sense, step_state
-from whill_mjx.evaluation.conditions import Condition, begin_under, nominal, seen_under
+from whill_mjx.evaluation.conditions import Condition, arranged, begin_under, nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.vehicle.kinematics import body_twist, reference_pose
 from whill_mjx.vehicle.types import VehicleParams
@@ -74,9 +74,13 @@ def rollout(
     changed = condition is not None
     if condition is None:
         condition = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, keys.shape), nominal())
-    states = jax.vmap(lambda p, key: reset_state(env, p, key))(params, keys)
-    if changed:
-        states = jax.vmap(lambda c, p, state: begin_under(c, env, p, state))(condition, params, states)
+
+    def begin(one: Condition, p: VehicleParams, key: jax.Array) -> State:
+        if not changed:
+            return reset_state(env, p, key)
+        return begin_under(one, env, p, reset_state(arranged(one, env), p, key))
+
+    states = jax.vmap(begin)(condition, params, keys)
     drive_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
     names = end_names(env, jax.tree.map(lambda leaf: leaf[0], states))
     memory = jax.vmap(driver.begin)(states, drive_keys) if driver.memory is None else driver.memory

@@ -21,7 +21,7 @@ import numpy as np
 
 from whill_mjx.batch import BatchEnv, BatchState, make_batch
 from whill_mjx.env import EVENT_METRICS, POSE_METRICS, make_env, observe
-from whill_mjx.evaluation.conditions import NAMES, Condition, begin_under, nominal
+from whill_mjx.evaluation.conditions import NAMES, Condition, arranged, begin_under, nominal
 from whill_mjx.io.fields import CONDITION, check, shown
 from whill_mjx.vehicle.types import TimeStep
 
@@ -49,8 +49,7 @@ class Kind:
         """(origin, condition or None) -> state and first time step of one instance."""
 
         def begin(origin: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
-            change = None if condition is None else lambda p, state: begin_under(condition, self.batch.env, p, state)
-            return strong(self.batch.begin_one(origin, change))
+            return strong(self._begin_one(origin, condition))
 
         return jax.jit(begin)
 
@@ -64,8 +63,7 @@ class Kind:
         """(origins (N,), condition or None) -> state and first time steps."""
 
         def begin(origins: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
-            change = None if condition is None else lambda p, state: begin_under(condition, self.batch.env, p, state)
-            return strong(jax.vmap(lambda origin: self.batch.begin_one(origin, change))(origins))
+            return strong(jax.vmap(lambda origin: self._begin_one(origin, condition))(origins))
 
         return jax.jit(begin)
 
@@ -97,6 +95,14 @@ class Kind:
     def picture(self) -> Any:
         """State -> camera image (H, W, 3) uint8 of one instance."""
         return jax.jit(lambda state: observe(self.batch.env, state.env))
+
+    def _begin_one(self, origin: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
+        if condition is None:
+            return self.batch.begin_one(origin)
+        env = arranged(condition, self.batch.env)
+        return dataclasses.replace(self.batch, env=env).begin_one(
+            origin, lambda params, state: begin_under(condition, env, params, state)
+        )
 
 
 def strong(tree: Any) -> Any:

@@ -83,7 +83,7 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
         """Start an episode in every instance, or in those of options["reset_mask"].
 
         Args:
-            seed: of instance 0, those after it get the next numbers; or one for each.
+            seed: of instance 0, those after it get the next numbers; or one for each. Instances that go on keep theirs.
             options: as of `WhillEnv`; and "reset_mask" (N,) bool.
 
         Raises:
@@ -162,12 +162,13 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
                                  "each instance.")
         if self._randoms is None:
             self._randoms = [gymnasium.utils.seeding.np_random(None)[0] for _ in range(count)]
-        for index, one in enumerate(seeds):
+        numbers = np.zeros(count, np.uint32)
+        for index in range(count) if mask is None else np.flatnonzero(mask):
+            one = seeds[index]
             if one is not None:
                 self._randoms[index] = gymnasium.utils.seeding.np_random(int(one))[0]
-        numbers = [int(random.integers(2**31)) if mask is None or mask[index] else 0
-                   for index, random in enumerate(self._randoms)]
-        return jax.vmap(jax.random.key)(np.asarray(numbers, np.uint32))
+            numbers[index] = self._randoms[index].integers(2**31)
+        return jax.vmap(jax.random.key)(numbers)
 
     def _observed(self, step: Any, mask: np.ndarray | None = None) -> tuple[Any, dict[str, Any]]:
         """Observations and info as arrays of the host."""

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import jax
 
+from dreamer.config import LEAST_TRAIN_RATIO, DreamerConfig
 from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, SHARE, OptionError, Range, With, check_known
 from whill_mjx.learning.setup import TRUTH, Preset, find_preset, with_layout, with_repeat, with_settings
 from whill_mjx.learning.shaping import SAFETY, find_safety
@@ -59,7 +60,7 @@ class TrainOptions:
     """Time between checkpoints [s]."""
     lr: Annotated[float | None, Range(0, 1, above=True)] = None
     """Learning rate; none takes the preset's."""
-    train_ratio: Annotated[float | None, Range(0, 1e6, above=True), MODEL] = None
+    train_ratio: Annotated[float | None, Range(LEAST_TRAIN_RATIO, 1e6), MODEL] = None
     """Replayed steps per environment step; none takes the preset's."""
     change: tuple[str, ...] = ()
     """Other settings of the learner, such as greedy_share=0.25 entropy_scale=3e-4."""
@@ -114,7 +115,7 @@ def choose_preset(options: TrainOptions) -> Preset:
     preset = find_preset(name, task, options.steps)
     preset = dataclasses.replace(preset, task=dataclasses.replace(preset.task, **read_fields(task, options.set)))
     _check_twice(options)
-    preset = with_layout(preset, options.layout)
+    preset = with_layout(preset, options.layout, options.looks, options.vehicle)
     if options.action_repeat is not None:
         preset = with_repeat(preset, options.action_repeat)
     learner, baseline = preset.learner, preset.ppo
@@ -122,15 +123,15 @@ def choose_preset(options: TrainOptions) -> Preset:
         learner = dataclasses.replace(learner, lr=options.lr)
         baseline = dataclasses.replace(baseline, lr=options.lr)
     if options.train_ratio is not None:
-        updates = round(learner.lr_decay * options.train_ratio / learner.train_ratio)  # the falling rate spans the run
-        decay = max(learner.warmup + 1, updates) if learner.lr_decay else 0
-        learner = dataclasses.replace(learner, train_ratio=options.train_ratio, lr_decay=decay)
+        learner = dataclasses.replace(learner, train_ratio=options.train_ratio)
     if options.targets:
         learner = dataclasses.replace(learner, decode_only=(TRUTH,))
     if options.learner == "ppo":
         baseline = with_settings(baseline, options.change)
     else:
         learner = with_settings(learner, options.change)
+    if not any(text.partition("=")[0] == "lr_decay" for text in options.change):
+        learner = _spanning(learner, preset.learner)
     return dataclasses.replace(
         preset,
         learner=learner,
@@ -140,12 +141,20 @@ def choose_preset(options: TrainOptions) -> Preset:
         eval_every=preset.eval_every if options.eval_every is None else options.eval_every,
         exploring_starts=preset.exploring_starts if options.exploring_starts is None else options.exploring_starts,
         second_tries=preset.second_tries if options.second_tries is None else options.second_tries,
-        looks=preset.looks if options.looks is None else options.looks,
         spread=preset.spread if options.spread is None else options.spread,
         vary=options.vary or preset.vary,
         safety=find_safety(options.safety),
         stop_success=options.stop_success if options.stop_success is not None else preset.stop_success,
     )
+
+
+def _spanning(learner: DreamerConfig, before: DreamerConfig) -> DreamerConfig:
+    """A changed learner whose falling rate spans as long a run as before, whatever its updates per step are now."""
+    shorter = before.replayed_per_update / learner.replayed_per_update
+    if not learner.lr_decay or (learner.train_ratio == before.train_ratio and shorter == 1.0):
+        return learner
+    updates = round(learner.lr_decay * learner.train_ratio / before.train_ratio * shorter)
+    return dataclasses.replace(learner, lr_decay=max(learner.warmup + 1, updates))
 
 
 def _check_twice(options: TrainOptions) -> None:

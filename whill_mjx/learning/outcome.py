@@ -40,7 +40,8 @@ def evaluate_policy(
     drivers = {"policy": driver, "random": random_driver(preset.task.action_repeat)}
     if options.planner:
         drivers["planner"] = planner_driver(course.env)
-    driven = evaluate_drivers(course, drivers, FINAL_SEED + options.seed, options.episodes, stage)
+    with jax.default_matmul_precision("highest"):  # float32, as on the vehicle; a GPU would round to fewer bits
+        driven = evaluate_drivers(course, drivers, FINAL_SEED + options.seed, options.episodes, stage)
     stage("drawing pictures and videos of the final evaluation")
     summary = write_report(options.out, course, driven, options.videos, say)
     references: dict[str, float] = {name: summary[name]["return"] for name in drivers if name != "policy"}
@@ -78,7 +79,8 @@ def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained
     weights = jax.tree.map(jnp.asarray, result.params)
     if SURPRISE in carry:
         keys = episode_keys(NOVELTY_SEED + options.seed, NOVELTY_EPISODES)
-        surprises = largest_surprise(course.env, course.params, policy, weights, carry, keys)
+        with jax.default_matmul_precision("highest"):  # as the runtime that will be held to these limits
+            surprises = largest_surprise(course.env, course.params, policy, weights, carry, keys)
         contract = dataclasses.replace(contract, novelty=limits(*surprises))
     shown, step = obs_shape_of(course.env), partial(policy, weights)
     try:

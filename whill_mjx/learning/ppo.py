@@ -135,6 +135,11 @@ def forward(config: PpoConfig, params: Any, frames: Any) -> tuple[jax.Array, jax
     return result
 
 
+PRIOR = 1e-4
+"""Weight of a variance of 1 beside the returns of an instance, as in Gymnasium's NormalizeReward. Without it the first
+rewards, which may be the same in all instances, would be divided by nothing."""
+
+
 @struct.dataclass
 class ReturnScale:
     """Running variance of the discounted return, by which rewards are divided."""
@@ -146,7 +151,7 @@ class ReturnScale:
 
     def std(self) -> jax.Array:
         """() standard deviation, 1 at the beginning."""
-        return jnp.where(self.count > 1, jnp.sqrt(self.squares / jnp.maximum(self.count - 1, 1)) + 1e-6, 1.0)
+        return jnp.sqrt(self.squares / self.count + 1e-8)
 
 
 @struct.dataclass
@@ -235,23 +240,24 @@ def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
     """State before the first step; `env` is a vector environment (`num_envs`, `obs_shape`, `action_dim`, reset, step).
 
     Raises:
-        ValueError: the minibatches do not divide a rollout.
+        ValueError: the minibatches do not divide a rollout, or scans have several lengths.
     """
-    check_minibatches(config, env.num_envs)
+    check_fit(env, config)
     env_key, net_key, key = jax.random.split(jax.random.key(seed), 3)
     env_state, step = env.reset(env_key)
     empty = empty_frames(config, env.obs_shape, (env.num_envs,))
     params = Network(config, env.action_dim).init(net_key, empty)
-    zero = jnp.zeros(())
-    scale = ReturnScale(jnp.zeros(env.num_envs), zero, zero, zero)
     return PpoState(
         params, optimiser(config, 1).init(params), env_state, step, push(empty, step.obs, step.is_first),
-        scale, key, jnp.zeros((), jnp.int32),
+        first_scale(env.num_envs), key, jnp.zeros((), jnp.int32),
     )  # fmt: skip
 
 
-def check_minibatches(config: PpoConfig, instances: int) -> None:
-    """Raise ValueError unless the minibatches divide a rollout of this many instances."""
+def check_fit(env: Any, config: PpoConfig) -> None:
+    """Raise ValueError where the minibatches do not divide a rollout, or scans have several lengths."""
+    instances = env.num_envs
+    if isinstance(env.obs_shape, Mapping):
+        rays_of(config, env.obs_shape)
     if instances * config.rollout % config.minibatches:
         raise ValueError(
             f"{instances} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "
@@ -327,6 +333,12 @@ def collect(
     _, _, last_value = forward(config, state.params, frames)
     state = dataclasses.replace(state, env_state=env_state, step=step, frames=frames, scale=scale, key=key)
     return state, rollout, last_value, {name: value.sum(0) for name, value in watched.items()}
+
+
+def first_scale(instances: int) -> ReturnScale:
+    """The return scale before the first step."""
+    weight = PRIOR * instances * jnp.ones(())
+    return ReturnScale(jnp.zeros(instances), weight, jnp.zeros(()), weight)
 
 
 def track(config: PpoConfig, scale: ReturnScale, reward: jax.Array, begins: jax.Array) -> ReturnScale:

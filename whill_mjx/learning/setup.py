@@ -17,6 +17,7 @@ import numpy as np
 from dreamer import agent as agents
 from dreamer.config import DreamerConfig
 from dreamer.config import preset as learner_preset
+from dreamer.iteration import check_fit
 from dreamer.types import FunctionalEnv, Mirror, Transition
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import POSE_METRICS, Env, State, make_env
@@ -179,11 +180,16 @@ def _changed(holder: Any, changes: Mapping[str, Any], where: str) -> Any:
     return dataclasses.replace(holder, **changes)
 
 
-def with_layout(preset: Preset, layout: str) -> Preset:
-    """The same training in worlds of this layout. Where all look alike, the mirror shows no more than one other."""
+def with_layout(preset: Preset, layout: str, looks: str | None = None, vehicle: str | Path | None = None) -> Preset:
+    """The same training of a vehicle in worlds of this layout and these looks; None keeps the preset's looks.
+
+    The mirror shows no more other worlds than there are.
+    """
     task = dataclasses.replace(preset.task, layout=layout)  # an unknown one is refused here
-    worlds = preset.learner.mirror if task.randomised else min(preset.learner.mirror, 1)
-    return dataclasses.replace(preset, task=task, learner=dataclasses.replace(preset.learner, mirror=worlds))
+    looks = preset.looks if looks is None else looks
+    worlds = min(preset.learner.mirror, mirror_worlds(make_env(task, vehicle, looks=looks)[0]))
+    learner = dataclasses.replace(preset.learner, mirror=worlds)
+    return dataclasses.replace(preset, task=task, looks=looks, learner=learner)
 
 
 def with_repeat(preset: Preset, repeat: int) -> Preset:
@@ -204,10 +210,14 @@ def with_repeat(preset: Preset, repeat: int) -> Preset:
         batch_length=length,
         batch_size=max(1, round(learner.replayed_per_update / length)),
     )
+    baseline = dataclasses.replace(
+        preset.ppo, discount=preset.ppo.discount**factor, rollout=max(1, round(preset.ppo.rollout / factor))
+    )
     return dataclasses.replace(
         preset,
         task=task,
         learner=learner,
+        ppo=baseline if factor != 1.0 else preset.ppo,
         total_steps=round(preset.total_steps / factor),
         eval_every=max(1, round(preset.eval_every / factor)),
     )
@@ -297,13 +307,15 @@ def functional_env(
             step = dataclasses.replace(step, reward=step.reward - jnp.where(step.first, 0.0, lost))
         return state, emit(state, step)
 
-    shape = obs_shape_of(batch.env)
-    if targets:
-        seen = shape if isinstance(shape, dict) else {"camera": shape}
-        shape = {**seen, TRUTH: (privileged.SIZE,)}
+    shape = with_truth(obs_shape_of(batch.env)) if targets else obs_shape_of(batch.env)
     return FunctionalEnv(
         num_envs=batch.count, obs_shape=shape, action_dim=2, reset=reset, step=step, mirror=mirror_of(batch)
     )
+
+
+def with_truth(shape: Any) -> dict[str, tuple[int, ...]]:
+    """Shapes by name of what a learner sees, and of TRUTH."""
+    return {**(shape if isinstance(shape, dict) else {"camera": shape}), TRUTH: (privileged.SIZE,)}
 
 
 def obs_shape_of(env: Env) -> Any:
@@ -332,10 +344,10 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
     what is learned from one drive is seen in several. Sensors are mirrored in one world; None where one of them cannot
     be.
     """
-    sensors = dict(batch.env.sensors)
+    sensors, most = dict(batch.env.sensors), mirror_worlds(batch.env)
+    if not most:
+        return None
     if sensors:
-        if any(sensor.mirrored is None for sensor in sensors.values()):
-            return None
         mirrors: dict[str, Any] = {name: sensor.mirrored for name, sensor in sensors.items()}
         mirrors[TRUTH] = privileged.mirrored
         return Mirror(
@@ -362,7 +374,23 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
         action = jnp.broadcast_to(action, (worlds, *action.shape))
         return turned(action, action * jnp.array([1.0, -1.0]))
 
-    return Mirror(other_obs, other_action, worlds=PAINTS if paints else 1)
+    return Mirror(other_obs, other_action, worlds=most)
+
+
+def mirror_worlds(env: Env) -> int:
+    """Other worlds that the mirror of an environment shows at most; 0 where it has none."""
+    if env.sensors:
+        return int(all(sensor.mirrored is not None for _, sensor in env.sensors))
+    return PAINTS if env.repaints else 1
+
+
+def check_learner(preset: Preset, learner: str, batch: BatchEnv) -> None:
+    """Raise ValueError where a preset's learner, "dreamer" or "ppo", does not suit what it would train on."""
+    env = functional_env(batch, preset.safety, targets=learner == "dreamer" and TRUTH in preset.learner.decode_only)
+    if learner == "dreamer":
+        check_fit(env, preset.learner)
+    else:
+        ppo.check_fit(env, preset.ppo)
 
 
 def make_training_env(preset: Preset, vehicle: str | Path | None, devices: tuple = ()) -> BatchEnv:
@@ -403,19 +431,23 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
     return tuple(found)
 
 
-def dreamer_policy(preset: Preset, control_dt: float) -> tuple[Step, dict[str, Any]]:
-    """The agent as the step of one instance, limits included, and its first carry."""
+def dreamer_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
+    """The agent as the step of one instance, limits included, and its first carry; for what `env` shows."""
     learner, seconds = preset.learner, control_dt * preset.task.action_repeat
     step: Step = lambda params, carry, image: agents.policy_step(learner, params, carry, image)  # noqa: E731
     carry = agents.policy_carry(learner, 2)
-    if preset.looks == "rich" and TRUTH in learner.decode_only:
-        believe = lambda params, carry: privileged.UNIT * agents.believed(params, carry)[:4]  # noqa: E731
+    if env.rich and TRUTH in learner.decode_only:
+        shape = with_truth(obs_shape_of(env))
+
+        def believe(params: Any, carry: Any) -> jax.Array:
+            return privileged.UNIT * agents.believed(params, carry, shape, TRUTH)[..., :4]
+
         step, carry = watched(step, carry, seconds, believe)
     return limited_policy(preset.task, preset.safety, step, carry, seconds)
 
 
 def ppo_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
-    """The same of the model-free baseline, for what `env` shows."""
+    """The same of the model-free baseline."""
     return limited_policy(
         preset.task, preset.safety, lambda params, carry, image: ppo.policy_step(preset.ppo, params, carry, image),
         ppo.policy_carry(preset.ppo, obs_shape_of(env)), control_dt * preset.task.action_repeat,

@@ -139,4 +139,4 @@ def policy_of(options: TrainOptions, preset: Preset, course: Course) -> tuple[St
     control_dt = course.env.model.config.control_dt
     if options.learner == "ppo":
         return ppo_policy(preset, control_dt, course.env)
-    return dreamer_policy(preset, control_dt)
+    return dreamer_policy(preset, control_dt, course.env)
