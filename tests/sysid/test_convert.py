@@ -222,6 +222,36 @@ def test_outside_pose_is_never_guessed_and_can_be_left_out(bag, tmp_path):
     assert log.trials[0].ground_truth is None and log.trials[0].odometry is not None
 
 
+@pytest.mark.parametrize("truth", ["/robot/ground_truth/state", "/base_pose_ground_truth", "/robot/odom_gt",
+                                   "/mocap/rigid_body/odom", "/OptiTrack/robot", "/true_odom"])
+@pytest.mark.parametrize("own", ["/robot/odom", ""])
+def test_a_topic_whose_name_says_truth_is_never_the_vehicles_odometry(tmp_path, truth, own):
+    bag = write_bag(tmp_path / "bag", topics=("/robot/cmd_vel", own, truth))
+    log, notes = convert(ConvertConfig(bag, tmp_path / "log"))
+    (trial,) = log.trials
+    assert any(f"ground_truth is taken from {truth}" in note and "--truth-topic ''" in note for note in notes)
+    assert trial.ground_truth.x[0] == pytest.approx(0.0, abs=0.02)  # the odometry's own begins at 3 m
+    assert any(f"odometry is taken from {own}" in note for note in notes) if own else trial.odometry is None
+
+
+def test_of_several_topics_that_say_truth_none_is_taken_unasked_and_the_first_can_be_named(tmp_path):
+    def second(rows):
+        return [*rows, *((t, "/vicon/wall/odom", kind, one) for t, topic, kind, one in rows if topic == "/gt/odom")]
+
+    bag = write_bag(tmp_path / "bag", topics=("/robot/cmd_vel", "/robot/odom", "/gt/odom"), edit=second)
+    log, notes = convert(ConvertConfig(bag, tmp_path / "log"))
+    assert log.trials[0].odometry is not None and log.trials[0].ground_truth is None
+    assert any("/gt/odom, /vicon/wall/odom may be one: --truth-topic /gt/odom" in note for note in notes)
+    log, _ = convert(ConvertConfig(bag, tmp_path / "named", odometry_topic="/gt/odom", truth_topic=""))
+    assert log.trials[0].odometry is not None and log.trials[0].ground_truth is None
+
+
+def test_a_name_that_only_contains_the_letters_of_truth_says_nothing(tmp_path):
+    bag = write_bag(tmp_path / "bag", topics=("/robot/cmd_vel", "/length/odom", ""))
+    log, _ = convert(ConvertConfig(bag, tmp_path / "log"))
+    assert log.trials[0].odometry is not None and log.trials[0].ground_truth is None
+
+
 def test_bags_of_one_folder_are_trials_and_can_be_added_later(bag, tmp_path):
     source = tmp_path / "bags"
     for name in ("figure_2", "figure_3"):

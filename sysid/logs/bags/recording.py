@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +16,10 @@ TOPICS = {
     "imu": ("/whill/imu", "/imu/data", "/imu", "/imu/data_raw"),
 }
 """Names that are looked for, the first found is taken. Odometry topics are never guessed to be ground truth."""
+TRUTH = re.compile(r"truth|(?<![a-z])(?:gt|true)(?![a-z])", re.IGNORECASE)
+"""In the names of what simulators publish of the vehicle itself."""
+TRACKERS = re.compile(r"mocap|motion_?capture|vicon|opti_?track|qualisys|vrpn|natnet", re.IGNORECASE)
+"""In the names of what tracking systems publish of any body."""
 TYPES = {
     "command": ("Twist", "TwistStamped"),
     "odometry": ("Odometry", CHAIR_STATE, "JointState"),
@@ -61,6 +66,11 @@ def find_bags(source: Path) -> list[Path]:
     if is_bag(source):
         return [source]
     return sorted(path for path in source.iterdir() if is_bag(path)) if source.is_dir() else []
+
+
+def from_outside(topic: str) -> bool:
+    """Whether a topic's name says that it is measured from outside, so that it is no vehicle's odometry."""
+    return bool(TRUTH.search(topic) or TRACKERS.search(topic))
 
 
 def short_type(kind: str) -> str:

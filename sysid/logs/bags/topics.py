@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sysid.logs.bags import transforms
-from sysid.logs.bags.recording import CHAIR_STATE, OPTIONS, TOPICS, TYPES, short_type
+from sysid.logs.bags.recording import CHAIR_STATE, OPTIONS, TOPICS, TRUTH, TYPES, from_outside, short_type
 
 WHAT = {"command": "commands that reached the vehicle", "odometry": "vehicle's odometry"}
 NOT_READ = {"AckermannDriveStamped": "which steers as cars do, and is not read",
@@ -37,7 +37,8 @@ def namespaces(known: Mapping[str, str]) -> list[tuple[str, ...]]:
 def no_pose(path: Path, known: Mapping[str, str], asked: Mapping[str, str], frames: str = "") -> ValueError:
     """The error where nothing measures the motion; `frames`: why the transforms give no pose."""
     poses = [] if asked.get("ground_truth") == "" else [
-        name for name, kind in sorted(known.items()) if short_type(kind) in TYPES["ground_truth"]]
+        name for name in sorted(known, key=lambda one: (not from_outside(one), one))
+        if short_type(known[name]) in TYPES["ground_truth"]]
     more = [*not_read(known), *([f"{', '.join(poses)} may be the outside pose: {OPTIONS['ground_truth']} {poses[0]}"]
                                  if poses else [])]
     return ValueError(f"{path}: neither odometry nor outside pose found (topics with messages: {listed(known)})."
@@ -73,6 +74,7 @@ def choose_topics(
     listing = listed(known)
     chosen: dict[str, str] = {}
     types = {**TYPES, "command": WHEELS} if wheels else TYPES
+    truths = _truths(known, asked)
     for stream in TOPICS:
         if wheels and stream == "command" and stream not in asked:
             chosen.update(_wheel_topic(path, known, listing))
@@ -94,20 +96,24 @@ def choose_topics(
         usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
         fitting = [name for name, kind in known.items() if short_type(kind) in TYPES[stream]
                    and name not in (*chosen.values(), *asked.values())
-                   and (stream == "ground_truth" or name not in TOPICS["ground_truth"])]
+                   and (stream == "ground_truth" or not from_outside(name))]
         fitting = [name for name in fitting if short_type(known[name]) != "JointState"] or fitting
         if usual:
             chosen[stream] = usual[0]
-        elif stream != "ground_truth" and len(fitting) == 1 and fitting[0] not in TOPICS["ground_truth"]:
+        elif stream == "ground_truth" and len(truths) == 1:
+            chosen[stream] = truths[0]
+            notes.append(f"{stream} is taken from {truths[0]}, as its name says that it is measured from outside. If "
+                         f"it is not, leave it out: {OPTIONS[stream]} ''")
+        elif stream != "ground_truth" and len(fitting) == 1:
             chosen[stream] = fitting[0]
             notes.append(f"{stream} is taken from {fitting[0]}, the only topic of a fitting type")
-        elif stream == "ground_truth" and (others := [name for name in fitting if "odom" not in name]):
+        elif stream == "ground_truth" and (others := truths or [name for name in fitting if "odom" not in name]):
             notes.append(f"no outside pose is taken. {', '.join(others)} may be one: {OPTIONS[stream]} {others[0]}, if "
                          "it measures the vehicle from outside")
         elif stream in ("command", "odometry") and len(fitting) > 1:
             said = (f"any of {', '.join(sorted(fitting))} may be the {WHAT[stream]}. Name one: {OPTIONS[stream]} "
                     f"{sorted(fitting)[0]}")
-            if stream == "command" or not {*TOPICS["ground_truth"], asked.get("ground_truth")} & set(known):
+            if stream == "command" or len(truths) != 1 and not asked.get("ground_truth"):
                 raise ValueError(f"{path}: {said}")
             notes.append(f"no odometry is taken: {said}")
     if "command" not in chosen and "command" not in asked:
@@ -120,11 +126,24 @@ def choose_topics(
     return chosen
 
 
+def _truths(known: Mapping[str, str], asked: Mapping[str, str]) -> list[str]:
+    """The topics that are an outside pose of the vehicle by their names; the usual one alone, where there is one.
+
+    Of what trackers publish only an Odometry is one: their poses are of any body.
+    """
+    if asked.get("ground_truth") == "":
+        return []
+    found = [name for name, kind in sorted(known.items()) if short_type(kind) in TYPES["ground_truth"]
+             and from_outside(name) and (TRUTH.search(name) or short_type(kind) == "Odometry")
+             and name not in asked.values()]
+    return [name for name in TOPICS["ground_truth"] if name in found][:1] or found
+
+
 def _wheel_topic(path: Path, known: dict[str, str], listing: str) -> dict[str, str]:
     """The topic whose wheel speeds are the input."""
     for kind in WHEELS:
         fitting = [name for name, one in known.items()
-                   if short_type(one) == kind and name not in TOPICS["ground_truth"]]
+                   if short_type(one) == kind and not from_outside(name)]
         usual = [name for name in TOPICS["odometry"] if name in fitting]
         if len(fitting) == 1 or usual:
             return {"command": (usual or fitting)[0]}
