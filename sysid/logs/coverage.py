@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid.logs.backward_wheel import ALIKE, backward_wheel
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.directions import UNLIKE
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
@@ -19,7 +20,6 @@ from sysid.logs.unusable import LOST, lost, said, stood
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
 SLOW_SECONDS = 1.0  # s of such commands that are enough
-ALIKE = 0.7  # correlation of a speed with a command that it follows
 SHORTEST = 6.0  # s of a trial in which clocks can be compared
 LEAST_REACH = 0.3  # m from the axle's centre that a tracked point may be at on the smallest vehicle
 CLOSELY = 0.8  # correlation with the command at a usual delay that needs no search for a better one
@@ -134,6 +134,8 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
     if jumped := set_forward(trials):  # these trials show no other fault, and hide none of the others
         others = tuple(trial for trial in trials if forward_jump(trial) is None)
         return [*jumped, *(faults(replace(log, trials=others), responses) if others else [])]
+    if backwards := backward_wheel(log):  # its speeds contradict every pose and command
+        return [backwards]
     found: list[str] = []
     cut = sum(uncommanded(trial) > 0 for trial in trials) >= len(trials) / 2  # as if it did not follow its commands
     contradicted = contradictions(trials, max(log.spec.track, LEAST_REACH))
@@ -228,17 +230,27 @@ def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
 
 
 def _exchanged(channel: str, trials: Sequence[Trial]) -> str:
-    """A sentence where measured speed follows the commanded yaw rate, and the reverse, not its own; else ""."""
-    other = [replace(one, command=Command(one.command.t, one.command.omega, one.command.v)) for one in trials]
-    for index in (1, 2):
-        as_it_is, follows = ([gain[1] for one in these if (gain := _gain(one, channel, index)) is not None]
-                             for these in (trials, other))
-        if not follows or np.median(follows) < ALIKE:
-            return ""
-        if as_it_is and 1 - np.median(follows) > UNLIKE * (1 - np.median(as_it_is)):
-            return ""
+    """A sentence where measured speed follows the commanded yaw rate, and the reverse, not its own; else "".
+
+    An outside pose must agree by how it turns, which no frame changes.
+    """
+    if not all(_follows_other(channel, trials, index) for index in (1, 2)) or (
+            _follows_other("ground_truth", trials, 2) is False):
+        return ""
     return (f"command: the speed that {channel} shows follows omega, and its yaw rate follows v: the two columns are "
             "exchanged.")
+
+
+def _follows_other(channel: str, trials: Sequence[Trial], index: int) -> bool | None:
+    """Whether a measured speed (1) or yaw rate (2) follows the command of the other, not its own; None where neither
+    is known."""
+    other = [replace(one, command=Command(one.command.t, one.command.omega, one.command.v)) for one in trials]
+    as_it_is, follows = ([gain[1] for one in these if (gain := _gain(one, channel, index)) is not None]
+                         for these in (trials, other))
+    if not follows:
+        return None
+    return bool(np.median(follows) >= ALIKE and not (
+        as_it_is and 1 - np.median(follows) > UNLIKE * (1 - np.median(as_it_is))))
 
 
 def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:

@@ -25,6 +25,7 @@ from sysid.logs.log import load_log
 from sysid.logs.measured import load_whole
 from sysid.logs.metrics import ideal_replay
 from sysid.logs.next_drives import next_drives
+from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of, with_timeout
 from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
 from sysid.search import thin
@@ -183,6 +184,56 @@ def test_units_and_signs_that_the_commands_contradict_are_named():
     millimetres = replace(good, ground_truth=replace(good.ground_truth, x=1e3 * good.ground_truth.x,
                                                      y=1e3 * good.ground_truth.y))
     assert any("must be in metres" in one for one in sanity(log_of(millimetres)))
+
+
+def counting_backwards(trial, side, track=WHILL_CR.track):
+    """The trial with an odometry of wheels of which one counts backwards."""
+    o, half = trial.odometry, (track if side == "left" else -track) / 2
+    v, omega = half * o.omega, o.v / half
+    return replace(trial, odometry=OdometryStream(o.t, *integrate_speeds(o.t, v, omega), v, omega))
+
+
+@pytest.mark.parametrize("pose", [True, False])
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("turning", [0.6, 0.0])
+def test_a_wheel_that_counts_backwards_is_named_instead_of_exchanged_columns_or_a_turned_pose(side, pose, turning):
+    good = trial_of(smooth_command(omega=turning))
+    good = good if pose else replace(good, ground_truth=None)
+    wrong = counting_backwards(good, side)
+    beside = "outside pose" if pose else "commands"
+    (found,) = sanity(log_of(wrong))
+    assert f"odometry: the {side} wheel counts backwards" in found and f"follow the {beside}" in found
+    scale = float(re.search(r"v must become (\S+) omega", found)[1])
+    assert scale == pytest.approx(0.248 if side == "left" else -0.248)
+    np.testing.assert_allclose(scale * wrong.odometry.omega, good.odometry.v, atol=1e-9)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_wheel_that_counts_backwards_is_named_where_wheel_speeds_are_the_input(side):
+    wrong = counting_backwards(trial_of(lively()), side)
+    o = wrong.odometry
+    trial = replace(wrong, command=Command(o.t, o.v, o.omega), odometry=None)
+    (found,) = sanity(replace(log_of(trial), fields={"input": "wheels"}))
+    assert f"command: the {side} wheel counts backwards" in found
+    good = trial_of(lively())
+    right = replace(good, command=Command(o.t, good.odometry.v, good.odometry.omega), odometry=None)
+    assert sanity(replace(log_of(right), fields={"input": "wheels"})) == []
+
+
+@pytest.mark.parametrize("pose", [True, False])
+def test_exchanged_commands_are_no_wheel_that_counts_backwards(pose):
+    good = trial_of(lively())
+    swapped = replace(good, command=Command(good.command.t, good.command.omega, good.command.v))
+    found = sanity(log_of(swapped if pose else replace(swapped, ground_truth=None)))
+    assert len(found) == 1 + pose and all("the two columns are exchanged" in one for one in found)
+
+
+def test_columns_are_not_said_to_be_exchanged_where_the_outside_pose_follows_them_as_they_are():
+    good = trial_of(lively())
+    o = good.odometry
+    wrong = replace(good, odometry=OdometryStream(o.t, *integrate_speeds(o.t, o.omega, o.v), o.omega, o.v))
+    found = sanity(log_of(wrong))
+    assert found and not any("the two columns are exchanged" in one for one in found)
 
 
 def lively(seconds=20.0):
