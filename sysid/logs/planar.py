@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
+TURN = 2 * np.pi * 1.02  # rad of an angle that wraps at a turn, with some noise
+OVERFLOW = 0.9  # share of all that an encoder counts by which it changes at once where its counter overflows
 
 
 def yaw_of(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -26,6 +28,18 @@ def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) ->
     low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
     dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
     return (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
+
+
+def without_wraps(angle: np.ndarray) -> np.ndarray:
+    """Angle (T,) of a wheel [rad] that goes on over turns. One that leaves a turn does so already, however far it gets
+    between two samples; but a counter of many turns may overflow."""
+    if np.ptp(angle) <= TURN:
+        return np.unwrap(angle)
+    steps = np.diff(angle)
+    over = np.abs(steps) > OVERFLOW * np.ptp(angle)
+    if over.any() and not over.all():
+        steps[over] = np.interp(np.flatnonzero(over), np.flatnonzero(~over), steps[~over])
+    return np.concatenate([angle[:1], angle[0] + np.cumsum(steps)])
 
 
 def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

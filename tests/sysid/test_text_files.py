@@ -260,6 +260,37 @@ def test_a_quaternion_by_which_the_vehicle_lies_on_its_side_is_named(tmp_path):
     assert any("lies on its side in ground_truth" in one and "order w, x, y, z" in one for one in notes)
 
 
+@pytest.mark.parametrize("wraps", [False, True])
+@pytest.mark.parametrize("lost", [False, True])
+def test_angles_of_wheels_are_unwrapped_only_where_they_wrap(wraps, lost):
+    radius, track = 0.033, 0.16
+    rate = 8.0 if wraps else 18.0  # rad/s: 3.6 rad from row to row at 5 Hz
+    t = np.arange(0.0, 20.0, 0.2)
+    t = t[(t < 5.0) | (t > 5.9)] if lost and not wraps else t  # a gap of two turns and a half
+    angle = rate * t
+    rows = np.column_stack([np.angle(np.exp(1j * angle)) if wraps else angle] * 2 + [0 * t + np.nan] * 2)
+    np.testing.assert_allclose(joint_twist(t, rows, radius, track), np.tile([rate * radius, 0.0], (len(t), 1)),
+                               atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [1440, 1000])
+@pytest.mark.parametrize("forward", [1.0, -1.0])
+def test_a_counter_that_overflows_is_no_jump_of_the_wheels(tmp_path, turn, forward):
+    c, angle = columns(), {}
+    for side, way in (("left", -1), ("right", 1)):
+        rate = (c["v"] + way * 0.25 * c["w"] + 0.3) / 0.1
+        angle[side] = forward * np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(c["t"]))])
+    half = {side: each[len(each) // 2] * turn / (2 * np.pi) for side, each in angle.items()}
+    ticks = {f"{side}_ticks": np.remainder(np.round(each * turn / (2 * np.pi) - half[side]), 65536)
+             for side, each in angle.items()}
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "cmd_v": forward * (c["cv"] + 0.3), "cmd_w": forward * c["cw"],
+                                          **ticks})
+    said = tuple(f"wheels.{side}_angle={side}_ticks:{turn}/rev" for side in ("left", "right"))
+    log, _ = convert(ConvertConfig(path, tmp_path / "data", columns=said, wheel_radius=0.1, track=0.5, vehicle="cart"))
+    went = 0.1 * np.gradient((angle["left"] + angle["right"]) / 2, c["t"])
+    np.testing.assert_allclose(log.trials[0].odometry.v, went, atol=0.02)
+
+
 def test_ticks_of_wheels_need_their_number_in_a_turn(tmp_path):
     c = columns()
     angle = np.cumsum((c["v"] - c["w"] * 0.248) / 0.1325) * np.median(np.diff(c["t"]))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.planar import twist_of_wheels
+from sysid.logs.planar import twist_of_wheels, without_wraps
 
 CHAIR_DEFINITION = """int32 battery_power
 float32 battery_current
@@ -47,7 +47,7 @@ def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: flo
     """(T, 2) v and omega of wheels: rows (T, 4) of left and right angle [rad] and rate [rad/s], or nan for rates."""
     rates = rows[:, 2:]
     if not np.isfinite(rates).all():
-        rates = np.gradient(np.unwrap(rows[:, :2], axis=0), t, axis=0)
+        rates = np.gradient(np.column_stack([without_wraps(angle) for angle in rows[:, :2].T]), t, axis=0)
     return np.column_stack(twist_of_wheels(rates[:, 0], rates[:, 1], wheel_radius, track))
 
 

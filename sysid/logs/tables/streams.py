@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid.logs.directions import RESPONSE, VARIED
-from sysid.logs.planar import DIFFERENCED, integrate_speeds, pose_speeds, twist_of_wheels, yaw_of
+from sysid.logs.planar import DIFFERENCED, integrate_speeds, pose_speeds, twist_of_wheels, without_wraps, yaw_of
 from sysid.logs.tables.columns import UNITS, Column, Table
 from sysid.logs.tables.headers import ONE_SIDE
 from whill_mjx.io.fields import counted
@@ -97,7 +97,7 @@ def with_rates(wheels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if "left" in wheels:
         return wheels
     t = wheels["t"]
-    return {"t": t, **{side: np.gradient(np.unwrap(wheels[f"{side}_angle"]), t) for side in ("left", "right")}}
+    return {"t": t, **{side: np.gradient(without_wraps(wheels[f"{side}_angle"]), t) for side in ("left", "right")}}
 
 
 def as_twist(rates: dict[str, np.ndarray], columns: Sequence[Column], stream: str,
