@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sysid.logs.bags.recording import OPTIONS
 from sysid.logs.conversion_options import ConvertConfig
 from sysid.logs.metrics import relative_pose
 from sysid.logs.planar import integrate_speeds
@@ -17,6 +18,7 @@ STILL = 1e-3  # m/s, rad/s of commands that a vehicle does not follow
 MOVING = {"v": 0.02, "omega": 0.03}  # m/s, rad/s of the odometry above which the vehicle counts as moving
 LEAD = 2.0  # s of standstill kept before and after a drive
 SHORTEST = 1.0  # s of motion below which a drive is left out
+LEFT_OUT = 0.1  # share of what was measured that a short stream costs, above which a note says so
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,9 @@ def cut_drives(
     """The trials of one recording, whole or cut at standstill, and notes."""
     if "ground_truth" in tables:
         tables["ground_truth"] = at_axle(tables["ground_truth"], config)
-    notes = []
+    notes = _short_stream(tables, source)
     if config.split == "bag":
-        ends = [(table[0, 0], table[-1, 0]) for name, table in tables.items() if name not in ("command", "imu")]
-        spans = [(max(begin for begin, _ in ends), min(end for _, end in ends))]
+        spans = [_shared(tables)]
     else:
         spans = drive_spans(tables, config.pause)
         notes.append(f"{len(spans)} drives between standstills of {config.pause:g} s")
@@ -56,6 +57,32 @@ def cut_drives(
         name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
         drives.append(cut(name, tables, span, source))
     return drives, notes
+
+
+def _measured(tables: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
+    """Begin and end [s] of each stream that a trial must have throughout."""
+    return {name: (float(table[0, 0]), float(table[-1, 0])) for name, table in tables.items()
+            if name not in ("command", "imu")}
+
+
+def _shared(tables: dict[str, np.ndarray]) -> tuple[float, float]:
+    """Begin and end [s] of what all measured streams cover."""
+    begins, ends = zip(*_measured(tables).values(), strict=True)
+    return max(begins), min(ends)
+
+
+def _short_stream(tables: dict[str, np.ndarray], source: Source) -> list[str]:
+    """A note on the measured stream that covers least, where the others lose much by it."""
+    spans = _measured(tables)
+    begin, end = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
+    first, last = _shared(tables)
+    if last - first >= (1 - LEFT_OUT) * (end - begin):
+        return []
+    name = min(spans, key=lambda one: spans[one][1] - spans[one][0])
+    stream, origin = source.streams.get(name, name), _origin(tables)
+    remedy = f"leave it out ({OPTIONS[name]} '')" if stream.startswith("/") else "convert without it"
+    return [f"{stream} covers {spans[name][0] - origin:.1f} to {spans[name][1] - origin:.1f} s of {end - origin:.1f} s: "
+            f"what was measured outside of that is left out. To keep it, {remedy}"]
 
 
 def cut(
@@ -101,8 +128,7 @@ def drive_spans(tables: dict[str, np.ndarray], pause: float) -> list[tuple[float
         else:
             merged.append((begin, end))
     merged = [(begin, end) for begin, end in merged if end - begin >= SHORTEST]
-    measured = [table for name, table in tables.items() if name not in ("command", "imu")]
-    first, last = max(table[0, 0] for table in measured), min(table[-1, 0] for table in measured)
+    first, last = _shared(tables)
     spans = []
     for k, (begin, end) in enumerate(merged):
         low = (merged[k - 1][1] + begin) / 2 if k else first

@@ -188,6 +188,19 @@ def test_header_stamps_undo_the_delay_of_receipt(bag, tmp_path):
     assert any("commands have no header" in note for note in notes)
 
 
+def test_what_a_stream_that_covers_little_costs_the_others_is_noted(bag, tmp_path):
+    short = write_bag(tmp_path / "drive", edit=lambda rows: [row for row in rows if row[1] != TRUTH or row[0] > 13])
+    log, notes = convert(ConvertConfig(short, tmp_path / "log"))
+    assert log.trials[0].duration < 9
+    (said,) = [note for note in notes if TRUTH in note and "covers" in note]
+    assert re.search(r"covers 13.* to 2.* s of 2.* s.*--truth-topic ''", said)
+    log, notes = convert(ConvertConfig(short, tmp_path / "whole", truth_topic=""))
+    assert log.trials[0].duration > 20 and not any("covers" in note for note in notes)
+    for split in ("bag", "standstill"):
+        _, notes = convert(ConvertConfig(bag, tmp_path / split, split=split))
+        assert not any("covers" in note for note in notes)
+
+
 def test_drives_are_split_at_standstill(bag, tmp_path):
     log, notes = convert(ConvertConfig(bag, tmp_path / "log", split="standstill", held_out=("figure_1-02",)))
     assert [trial.name for trial in log.trials] == ["figure_1-01", "figure_1-02"]
@@ -482,6 +495,26 @@ def test_a_bag_whose_recorder_was_killed_is_read_by_the_name_of_its_folder(bag, 
     packed.write_bytes(b"(")
     with pytest.raises(ValueError, match=r"packed_0.db3.zstd: cannot be unpacked .*zstd -d"):
         convert(ConvertConfig(tmp_path / "packed", tmp_path / "other"))
+
+
+@pytest.mark.parametrize(("name", "trial"), [("circle_2/circle_2_0.db3", "circle_2"),
+                                             ("renamed/circle_2_0.db3", "circle_2_0")])
+def test_a_recording_that_was_killed_is_read_beside_those_that_were_closed(bag, tmp_path, name, trial):
+    shutil.copytree(bag, tmp_path / "bags" / "circle_1")
+    killed = tmp_path / "bags" / name
+    killed.parent.mkdir()
+    shutil.copy(next(bag.glob("*.db3")), killed)
+    (tmp_path / "bags" / "photos").mkdir()
+    log, _ = convert(ConvertConfig(tmp_path / "bags", tmp_path / "log"))
+    assert [one.name for one in log.trials] == ["circle_1", trial]
+
+
+def test_recordings_that_were_all_killed_are_read_by_the_names_of_their_folders(bag, tmp_path):
+    for name in ("circle_1", "circle_2"):
+        (tmp_path / "bags" / name).mkdir(parents=True)
+        shutil.copy(next(bag.glob("*.db3")), tmp_path / "bags" / name / f"{name}_0.db3")
+    log, _ = convert(ConvertConfig(tmp_path / "bags", tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["circle_1", "circle_2"]
 
 
 TUM = "# timestamp tx ty tz qx qy qz qw\n" + "1.0 0.1 0.2 0 0 0 0 1\n" * 3
