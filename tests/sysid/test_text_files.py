@@ -260,6 +260,66 @@ def test_a_quaternion_by_which_the_vehicle_lies_on_its_side_is_named(tmp_path):
     assert any("lies on its side in ground_truth" in one and "order w, x, y, z" in one for one in notes)
 
 
+def trajectory(axes, up):
+    """The drive in TUM's form in a frame of which two axes are those of the floor, forward and left, and one is up."""
+    c = columns()
+    place = {axis: 0 * c["gx"] for axis in "xyz"}
+    place |= {axes[0][-1]: c["gx"], axes[1][-1]: (-1 if axes[1][0] == "-" else 1) * c["gy"]}
+    parts = {axis: 0 * c["gx"] for axis in "xyz"} | {up[-1]: (-1 if up[0] == "-" else 1) * np.sin(c["gyaw"] / 2)}
+    return {"timestamp": c["t"], **{f"t{axis}": place[axis] for axis in "xyz"},
+            **{f"q{axis}": parts[axis] for axis in "xyz"}, "qw": np.cos(c["gyaw"] / 2)}
+
+
+def beside_commands(folder, table, name="traj.txt"):
+    c = columns()
+    write(folder / "u.csv", {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"]})
+    write(folder / name, table, separator=" ", header=False)
+    return folder
+
+
+@pytest.mark.parametrize(("name", "stream"), [("traj.txt", "ground_truth"), ("odom.txt", "odometry"),
+                                              ("odom_gt.txt", "ground_truth"), ("cmd.txt", "ground_truth")])
+def test_a_trajectory_is_of_one_stream_by_whatever_name(tmp_path, name, stream):
+    log, _ = convert(ConvertConfig(beside_commands(tmp_path / "d", trajectory("xy", "z"), name), tmp_path / "log"))
+    found = getattr(log.trials[0], stream)
+    assert sum(one is not None for one in (log.trials[0].odometry, log.trials[0].ground_truth)) == 1
+    np.testing.assert_allclose(np.ptp(found.yaw), np.ptp(columns()["gyaw"]), atol=0.01)
+
+
+@pytest.mark.parametrize(("axes", "up"), [(("z", "-x"), "-y"), (("z", "x"), "y"), (("y", "z"), "x")])
+def test_a_trajectory_of_a_camera_says_which_columns_to_take_and_these_work(tmp_path, axes, up):
+    drive = beside_commands(tmp_path / "d", trajectory(axes, up))
+    with pytest.raises(ValueError, match=f"whose {up[-1]} axis is the vertical one") as error:
+        convert(ConvertConfig(drive, tmp_path / "log"))
+    assert "on its side" not in str(error.value)
+    said = re.search(r"--columns (.*?qw)\.", str(error.value))[1]
+    said = said if up[0] == "-" else said.replace(":--", "").replace(":-m", "")
+    log, notes = convert(ConvertConfig(drive, tmp_path / "log", columns=tuple(said.split())))
+    c, pose = columns(), log.trials[0].ground_truth
+    for name in ("x", "y", "yaw"):
+        np.testing.assert_allclose(getattr(pose, name), np.interp(pose.t, c["t"] - c["t"][0], c[f"g{name}"]), atol=2e-3)
+    assert not any(note.startswith("!") for note in notes)
+
+
+@pytest.mark.parametrize("height", [lambda c: 0.05 * c["gx"], lambda c: 0.01 * np.sin(9 * c["t"])])
+def test_a_trajectory_up_a_slope_or_with_noise_is_of_the_floor(tmp_path, height):
+    c = columns()
+    straight = trajectory("xy", "z") | {"ty": 1e-3 * np.sin(7 * c["t"]), "qz": 0 * c["t"], "qw": 1 + 0 * c["t"]}
+    drive = beside_commands(tmp_path / "d", straight | {"tz": height(c)})
+    write(drive / "u.csv", {"t": c["t"], "cmd_v": c["cv"], "cmd_w": 0 * c["cw"]})
+    log, _ = convert(ConvertConfig(drive, tmp_path / "log"))
+    assert log.trials[0].ground_truth is not None
+
+
+def test_files_of_one_name_but_for_their_kind_are_kept_apart(tmp_path):
+    c = columns()
+    drive = beside_commands(tmp_path / "d", trajectory("xy", "z"), "drive1.txt")
+    (drive / "u.csv").rename(drive / "drive1.csv")
+    log, notes = convert(ConvertConfig(drive, tmp_path / "log"))
+    assert log.trials[0].ground_truth is not None and log.trials[0].command.v.max() == pytest.approx(c["cv"].max())
+    assert any("ground_truth.x=drive1.txt/tx" in note for note in notes)
+
+
 @pytest.mark.parametrize("wraps", [False, True])
 @pytest.mark.parametrize("lost", [False, True])
 def test_angles_of_wheels_are_unwrapped_only_where_they_wrap(wraps, lost):

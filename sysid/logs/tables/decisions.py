@@ -17,6 +17,8 @@ from sysid.logs.tables.sizes import TURNED
 from whill_mjx.io.fields import shown
 
 NAMED = 12  # columns that an error lists
+FAR_MORE, STEEP, LEAST_WAY = 3.0, 0.3, 0.3
+"""Times the least of x and y, share of the greatest, and m of that at least: no vehicle on a floor rises by as much."""
 
 
 def read_decision(text: str, tables: Sequence[Table]) -> Column:
@@ -34,7 +36,8 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
                 unit = rest[len(written) :].strip()
                 if rest.startswith(written) and (not unit or unit.startswith(":")):
                     unit = unit_of(unit[1:].strip()) if unit else ""
-                    sign = -1.0 if unit.startswith("-") and role != "time" and kind_of(role) != "none" else 1.0
+                    plain = "-" if kind_of(role) == "none" else ""  # a unit that is a minus itself
+                    sign = -1.0 if unit.startswith("-") and unit != plain and role != "time" else 1.0
                     unit = unit_of(unit[1:]) if sign < 0 else unit
                     if unit and not is_unit_of(role, unit):
                         ticks = {"time": ", Nhz for N rows in a second"}.get(
@@ -120,6 +123,8 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         said = said or next((f" If its {name} counts rows, say how many there are in a second: time={table.stem}/{name}"
                              ":100hz." for name in table.columns if COUNTS.search(name)), "")
         return f"no column of {timeless[0]} is surely its time.{said}"
+    if sideways := _of_a_camera(tables, columns):
+        return sideways
     arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
     for one in columns:
         values = arrays[one.file, one.name]
@@ -151,6 +156,26 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
                       for one in unsure if TICKS.search(one.name)), "")
         return f"it is not clear what {', '.join(f'{one.file}/{one.name}' for one in unsure)} " + (
             "is." if len(unsure) == 1 else "are.") + ticks
+    return ""
+
+
+def _of_a_camera(tables: Sequence[Table], columns: Sequence[Column]) -> str:
+    """A sentence on a trajectory in TUM's form, guessed to be of the floor, whose z moves as none does on a floor."""
+    guessed = {(one.file, one.name): one.role.partition(".")[0] for one in columns if one.why not in ("", SAID)}
+    for table in tables:
+        stream = guessed.get((table.stem, "tx"))
+        if stream is None or guessed.get((table.stem, "ty")) != stream or "tz" not in table.columns:
+            continue
+        x, y, z = (float(np.subtract(*np.nanpercentile(table.columns[name], (98, 2)))) for name in ("tx", "ty", "tz"))
+        if z < FAR_MORE * min(x, y) or z < STEEP * max(x, y, LEAST_WAY):
+            continue
+        up, least, axes = (("tx", x, ("ty", "tz", "qy", "qz", "qx")) if x < y > STEEP * z else
+                           ("ty", y, ("tz", "tx", "qz", "qx", "qy")))
+        decided = [f"{stream}.{role}={table.stem}/{name}{turned}" for role, name, turned in zip(
+            ("x", "y", "qx", "qy", "qz", "qw"), (*axes, "qw"), ("", ":-m", "", ":--", ":--", ""), strict=True)]
+        return (f"its tz moves by {z:.2g} m, {up} by {least:.2g} m: its frame is that of a camera, whose {up[1]} axis "
+                f"is the vertical one. Where {up[1]} points down, as ORB-SLAM writes it: --columns {' '.join(decided)}. "
+                f"Where {up[1]} points up: the same without the three minus units.")
     return ""
 
 

@@ -49,7 +49,8 @@ def read_drives(
         tables = []
         for path in files:
             try:
-                tables.append(read_table(path))
+                alone = sum(other.stem == path.stem for other in files) == 1
+                tables.append(read_table(path) if alone else replace(read_table(path), stem=path.name))
             except ValueError as error:
                 refused.append(error)
         if not tables:

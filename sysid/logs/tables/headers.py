@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from sysid.logs.tables.cells import are_numbers, number_of
-from sysid.logs.tables.columns import unit_named
+from sysid.logs.tables.columns import TUM, unit_named
 from sysid.logs.tables.names import with_unit
 
-TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 ONE_SIDE = 0.5  # of the squares of qx and qy of a vehicle that lies on its side
 NUMBERED = re.compile(r"(\d+(?:(?:[\s,]+|\s*\.\.\s*)\d+)*)[\s:.)]+([^\W\d].*)")
 """A comment that gives columns names by their numbers, as loggers for MATLAB write it."""

@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from sysid.logs.tables.columns import QUANTITIES, SPELLED, UNITS, Column, Table, unit_of
+from sysid.logs.tables.columns import QUANTITIES, SPELLED, TUM, UNITS, Column, Table, unit_of
 
 STREAM_WORDS = {
     "command": ("cmd", "command", "commands", "commanded", "desired", "des", "ref", "reference", "setpoint", "target",
@@ -129,6 +129,9 @@ def _quantity(words: list[str]) -> str | None:
 def _stream_named(words: list[str], file: list[str], quantity: str, table: Table) -> tuple[str | None, bool]:
     """Stream of a quantity, and whether its name or its file's says so."""
     wheel = quantity in QUANTITIES["wheels"]
+    if len(words) == 1 and words[0] in TUM and set(TUM[1:]) <= set(table.columns):  # a trajectory is of one stream
+        odometry = set(file) & set(STREAM_WORDS["odometry"]) and not set(file) & set(STREAM_WORDS["ground_truth"])
+        return "odometry" if odometry else "ground_truth", True
     for place in (words, file):
         for stream, known in STREAM_WORDS.items():
             if set(place) & set(known):

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from sysid.logs.tables.cells import are_numbers, numbers_of, without_separators
-from sysid.logs.tables.columns import Table, unit_named
+from sysid.logs.tables.columns import TUM, Table, unit_named
 from sysid.logs.tables.headers import (
     PREAMBLE,
-    TUM,
     cells_of,
     numbered_names,
     stacked_names,
