@@ -48,16 +48,16 @@ def main(config: ConvertConfig) -> Log:
 def to_lerobot(config: ConvertConfig) -> Log:
     """Write a dataset as a LeRobotDataset, whole or not at all."""
     from sysid.logs import lerobot
-    from sysid.logs.measured import load_any
+    from sysid.logs.measured import load_whole
 
     with refusing():
-        log = load_any(config.source)
+        log = load_whole(config.source, config.select)
         check_place("--out", config.out)
         if config.out.exists():
             raise FolderRefused(f"--out {config.out}: exists already. Choose another place.")
         with TemporaryDirectory(prefix=f".{config.out.name}.", dir=_made(config.out.parent)) as partial:
             made = Path(partial) / config.out.name
-            notes = lerobot.write(made, log, config.fps)
+            notes = [*log.notes, *lerobot.write(made, log, config.fps)]
             made.rename(config.out)
     for note in notes:
         print(note)

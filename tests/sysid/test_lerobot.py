@@ -63,6 +63,26 @@ def test_drives_come_back_with_names_geometry_and_held_out_trials(source, writte
     np.testing.assert_allclose(*changes, atol=0.011)  # half a frame
 
 
+def test_the_dataset_is_exported_whole_and_its_notes_are_printed(source, tmp_path, capsys):
+    folder = shutil.copytree(source, tmp_path / "long")
+    for file in (folder / "trials" / "turn_1").glob("*.csv"):  # the same drive 20 times as slow
+        names, *rows = file.read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        file.write_text("\n".join([names, *(",".join([f"{20 * float(one[0]):.6f}", *one[1:]]) for one in cells)]) + "\n")
+    standing = folder / "trials" / "straight_1" / "odometry.csv"
+    t, *_ = np.loadtxt(standing, delimiter=",", skiprows=1).T
+    np.savetxt(standing, np.column_stack([t] + 5 * [0 * t]), delimiter=",", header="t,x,y,yaw,v,omega", comments="")
+    truth = standing.with_name("ground_truth.csv")
+    t, *_ = np.loadtxt(truth, delimiter=",", skiprows=1).T
+    np.savetxt(truth, np.column_stack([t] + 3 * [0 * t]), delimiter=",", header="t,x,y,yaw", comments="")
+    (folder / "dataset.toml").write_text('input = "wheels"\n' + (folder / "dataset.toml").read_text())
+    main(ConvertConfig(folder, tmp_path / "out", to="lerobot", fps=10))
+    assert "measured wheel speeds, not commands" in capsys.readouterr().out
+    log, _ = convert(ConvertConfig(tmp_path / "out", tmp_path / "back"))
+    durations = {trial.name: trial.duration for trial in log.trials}
+    assert sorted(durations) == sorted(DRIVES) and durations["turn_1"] > 150
+
+
 def test_the_layout_is_that_of_version_3(written):
     import pyarrow.parquet as pq
 
