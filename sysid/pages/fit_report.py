@@ -324,4 +324,6 @@ def _size(what: str, stated: float, value: float, low: float, high: float) -> st
 
 
 def _range(one: Estimate, digits: int, unit: Callable[[float], float] = float) -> str:
-    return f"{unit(one.low):.{digits}f} to {unit(one.high):.{digits}f}"
+    """The interval of the size of an estimate: of one below 0 to the other side, as the text beside it has no sign."""
+    low, high = (one.low, one.high) if one.value >= 0 else (-one.high, -one.low)
+    return f"{unit(low):.{digits}f} to {unit(high):.{digits}f}"

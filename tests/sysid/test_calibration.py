@@ -162,6 +162,13 @@ def test_without_an_outside_pose_the_report_says_that_sizes_are_taken_as_stated(
     at_it = [Estimate(f"pose_mount.{axis}", 0.0, 1e-4, -1e-3, 1e-3, True, "") for axis in ("x", "y", "yaw")]
     assert calibration_notes(at_it, uncalibrated.spec, uncalibrated.training) == [
         "The outside pose follows the reference point, within 1.0 mm and 0.06 degrees."]
+    beside = [Estimate("pose_mount.x", 0.0, -0.05, -0.052, -0.048, True, ""),
+              Estimate("pose_mount.y", 0.0, -0.03, -0.031, -0.028, True, ""),
+              Estimate("pose_mount.yaw", 0.0, np.deg2rad(-2.0), np.deg2rad(-2.5), np.deg2rad(-1.9), True, "")]
+    assert calibration_notes(beside, uncalibrated.spec, uncalibrated.training) == [
+        "The tracked point lies 0.0500 m behind (0.0480 to 0.0520) and 0.0300 m right of (0.0280 to 0.0310) the "
+        "reference point.",
+        "Its heading is turned by 2.00 degrees to the right of the vehicle's (1.90 to 2.50 degrees)."]
 
 
 @pytest.fixture(scope="module")
