@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,19 +26,34 @@ def drive(timeout, seed, delay=0.12, lag=0.2, period=0.1, rate=20.0, noise=0.005
         sent = sent[(sent <= begin) | (sent >= begin + 3)]
     speed = np.where((sent > 1.0) & (sent < 20.0), 0.5, 0.0)
     command = Command(sent, 0 * sent if turning else speed, speed if turning else 0 * sent)
+    return followed(command, timeout, random, 22.0, delay, lag, rate, noise)
+
+
+def presses(timeout, seed, lag=0.2, sizes=(0.5, -0.5), turning=False):
+    """A drive by 18 commands some 3 s apart, as of a person that presses keys."""
+    random = np.random.default_rng(seed)
+    sent = 1.0 + 3.0 * np.arange(18) + random.uniform(-0.2, 0.2, 18)
+    speed = random.choice(sizes, 18)
+    command = Command(sent, 0 * sent if turning else speed, speed if turning else 0 * sent)
+    return followed(command, timeout, random, sent[-1] + 3.0, 0.12, lag, 20.0, 0.005)
+
+
+def followed(command, timeout, random, end, delay, lag, rate, noise):
+    """The trial of a vehicle that follows commands for v or for omega late and slowly."""
+    turning = bool(np.any(command.omega))
     held = with_timeout(command, timeout) if np.isfinite(timeout) else command
-    t = np.arange(0.0, 22.0, DT)
+    t = np.arange(0.0, end, DT)
     rows = np.searchsorted(held.t, t - delay, side="right") - 1
     target = np.where(rows >= 0, (held.omega if turning else held.v)[np.maximum(rows, 0)], 0.0)
     speed = np.zeros_like(t)
     for k in range(len(t) - 1):
         speed[k + 1] = speed[k] + DT / lag * (target[k] - speed[k])
     way = np.cumsum(speed) * DT
-    seen = np.arange(0.0, 21.9, 1 / rate)
+    seen = np.arange(0.0, end - 0.1, 1 / rate)
     x, v = np.interp(seen, t, way), np.interp(seen, t, speed) + noise * random.standard_normal(len(seen))
     odometry = (OdometryStream(seen, 0 * x, 0 * x, x, 0 * v, v) if turning else
                 OdometryStream(seen, x, 0 * x, 0 * x, v, 0 * v))
-    return make_trial(f"drive_{seed}", command, odometry, None)
+    return make_trial(f"drive_{random.integers(10**6)}", command, odometry, None)
 
 
 @pytest.mark.parametrize("turning", [False, True])
@@ -58,6 +75,35 @@ def test_the_interval_holds_the_truth_about_as_often_as_it_says():
 
 def test_a_base_that_drives_on_has_none():
     assert command_timeout([drive(np.inf, 1)]) is None
+
+
+@pytest.mark.parametrize("turning", [False, True])
+@pytest.mark.parametrize(("timeout", "lag"), [(0.3, 0.1), (0.6, 0.1), (0.6, 0.2), (1.0, 0.2), (1.5, 0.3)])
+def test_the_time_out_of_a_base_driven_by_key_presses_is_found(timeout, lag, turning):
+    found = command_timeout([presses(timeout, seed, lag, turning=turning) for seed in range(2)])
+    assert found.stops >= 32 and found.low - 0.01 <= timeout <= found.high + 0.01
+    assert found.value == pytest.approx(timeout, abs=0.02)
+
+
+@pytest.mark.parametrize("sizes", [(0.5, -0.5), (0.5, 0.05), (0.5, 0.06, -0.3)])
+def test_a_base_that_drives_on_between_rare_commands_has_none(sizes):
+    assert command_timeout([presses(np.inf, seed, sizes=sizes) for seed in range(3)]) is None
+
+
+def test_rare_commands_in_a_dead_zone_show_no_time_out():
+    trials = []
+    for seed in range(3):
+        trial = presses(np.inf, seed, sizes=(0.5, 0.3, 0.06))
+        dead = np.abs(trial.command.v) < 0.1
+        command = trial.command
+        stands = followed(Command(command.t, np.where(dead, 0.0, command.v), command.omega), np.inf,
+                          np.random.default_rng(seed), float(command.t[-1]) + 3.0, 0.12, 0.2, 20.0, 0.005)
+        trials.append(replace(stands, command=command))
+    assert command_timeout(trials) is None
+
+
+def test_a_vehicle_that_stops_before_it_reaches_its_commands_shows_no_size_of_its_time_out():
+    assert command_timeout([presses(0.3, 1, lag=0.5)]) is None
 
 
 def write(folder, trials, fields=""):
