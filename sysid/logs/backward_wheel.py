@@ -39,14 +39,14 @@ def _speeds_beside(trial: Trial, beside: str, measured_input: bool) -> tuple[np.
     """Speeds (2, G) v, omega of the wheels, and what they should be; None where a trial lacks one."""
     pose, odometry = speeds(trial, "ground_truth"), speeds(trial, "odometry", smooth=True)
     if beside == "outside pose" and pose is not None and measured_input:
-        return np.stack(trial.command.at(pose[0], (0.0, 0.0))), np.stack(pose[1:])
+        return np.array(trial.command.at(pose[0], (0.0, 0.0))), np.array(pose[1:])
     if odometry is None or beside == "outside pose" and pose is None:
         return None
     if beside == "commands" or pose is None:
-        return np.stack(odometry[1:]), np.stack(trial.command.at(odometry[0] - RESPONSE, (0.0, 0.0)))
+        return np.array(odometry[1:]), np.array(trial.command.at(odometry[0] - RESPONSE, (0.0, 0.0)))
     inside = (pose[0] >= odometry[0][0]) & (pose[0] <= odometry[0][-1])
-    return (np.stack([np.interp(pose[0][inside], odometry[0], one) for one in odometry[1:]]),
-            np.stack([one[inside] for one in pose[1:]]))
+    return (np.array([np.interp(pose[0][inside], odometry[0], one) for one in odometry[1:]]),
+            np.array([one[inside] for one in pose[1:]]))
 
 
 def _alike(own: np.ndarray, reference: np.ndarray) -> bool:

@@ -81,8 +81,8 @@ def _short_stream(tables: dict[str, np.ndarray], source: Source) -> list[str]:
     name = min(spans, key=lambda one: spans[one][1] - spans[one][0])
     stream, origin = source.streams.get(name, name), _origin(tables)
     remedy = f"leave it out ({OPTIONS[name]} '')" if stream.startswith("/") else "convert without it"
-    return [f"{stream} covers {spans[name][0] - origin:.1f} to {spans[name][1] - origin:.1f} s of {end - origin:.1f} s: "
-            f"what was measured outside of that is left out. To keep it, {remedy}"]
+    covers = f"{spans[name][0] - origin:.1f} to {spans[name][1] - origin:.1f} s of {end - origin:.1f} s"
+    return [f"{stream} covers {covers}: what was measured outside of that is left out. To keep it, {remedy}"]
 
 
 def cut(

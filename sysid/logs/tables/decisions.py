@@ -174,8 +174,8 @@ def _of_a_camera(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         decided = [f"{stream}.{role}={table.stem}/{name}{turned}" for role, name, turned in zip(
             ("x", "y", "qx", "qy", "qz", "qw"), (*axes, "qw"), ("", ":-m", "", ":--", ":--", ""), strict=True)]
         return (f"its tz moves by {z:.2g} m, {up} by {least:.2g} m: its frame is that of a camera, whose {up[1]} axis "
-                f"is the vertical one. Where {up[1]} points down, as ORB-SLAM writes it: --columns {' '.join(decided)}. "
-                f"Where {up[1]} points up: the same without the three minus units.")
+                f"is the vertical one. Where {up[1]} points down, as ORB-SLAM writes it: --columns "
+                f"{' '.join(decided)}. Where {up[1]} points up: the same without the three minus units.")
     return ""
 
 
