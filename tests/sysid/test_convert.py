@@ -151,6 +151,37 @@ def test_joint_states_beside_commands_are_the_odometry(tmp_path):
     assert odometry.v.max() == pytest.approx(0.5, abs=1e-3) and odometry.yaw.max() == pytest.approx(6.0, abs=0.1)
 
 
+@pytest.mark.parametrize(("position", "gone", "said"), [
+    (np.zeros(0), [100], "1 messages with numbers that are not finite"),
+    (np.zeros(2), [100, 101, 102], "3 messages with numbers that are not finite"),
+    (None, range(1, 420), ""),
+])
+def test_joint_states_without_rates_are_left_out_or_their_angles_are_taken(tmp_path, position, gone, said):
+    kind, empty = "sensor_msgs/msg/JointState", np.zeros(0)
+
+    def wheels(rows):
+        made, angle = [row for row in rows if row[1] == COMMAND], np.zeros(2)
+        for k, t in enumerate(np.arange(0.0, 21.0, 0.05)):
+            v, omega, *_ = motion(t)
+            rates = np.array([v - omega * 0.08, v + omega * 0.08]) / 0.033
+            angle = angle + 0.05 * rates
+            made.append((t, "/joint_states", kind, message(
+                kind, header=header(T0 + t), name=["left_wheel", "right_wheel"], effort=empty,
+                position=angle if position is None else position, velocity=rates + (np.nan if k in gone else 0.0))))
+            made.append((t + 0.01, "/joint_states", kind, message(
+                kind, header=header(T0 + t), name=["arm"], position=np.zeros(1), velocity=np.zeros(1), effort=empty)))
+        return sorted(made, key=lambda row: row[0])
+
+    bag = write_bag(tmp_path / "drive", edit=wheels)
+    log, notes = convert(ConvertConfig(bag, tmp_path / "data", wheel_radius=0.033, track=0.16))
+    odometry = log.trials[0].odometry
+    moving = (odometry.t > 2.5) & (odometry.t < 7.5)
+    np.testing.assert_allclose(odometry.v[moving], 0.5, atol=1e-3)
+    assert len(odometry.t) == pytest.approx(420 - len(gone) if said else 420, abs=2)
+    assert any("420 messages without a wheel are left out" in note for note in notes)
+    assert any(said in note for note in notes) if said else not any("not finite" in note for note in notes)
+
+
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_a_bag_becomes_a_trial_that_the_loader_accepts(tmp_path, storage):
     write_bag(tmp_path / "circle_1", storage)

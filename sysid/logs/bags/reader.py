@@ -22,7 +22,14 @@ from sysid.logs.bags.frames import frame_streams, unposed
 from sysid.logs.bags.messages import header_time, read_message, sideways_speed, without_stamp
 from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS, OPTIONS, PACKED, SUFFIXES, Bag, BagStream, short_type
 from sysid.logs.bags.topics import choose_topics, framed, no_pose, not_read
-from sysid.logs.bags.wheel_states import CHAIR_DEFINITION, COARSE, JOYSTICK_FIELDS, chair_odometry, joint_twist
+from sysid.logs.bags.wheel_states import (
+    CHAIR_DEFINITION,
+    COARSE,
+    JOYSTICK_FIELDS,
+    chair_odometry,
+    joint_twist,
+    usable_joints,
+)
 from sysid.logs.planar import integrate_speeds
 from whill_mjx.io.reading import LONGEST_REASON
 
@@ -150,7 +157,7 @@ def _usable(
         return np.zeros((0, 2))
     table = np.array(rows, float)
     unset = np.isinf(table[:, 2:]).any(axis=1)
-    finite = np.isfinite(table[:, 2:]).all(axis=1) | (kind == "JointState") & ~unset
+    finite = usable_joints(table[:, 2:]) if kind == "JointState" else np.isfinite(table[:, 2:]).all(axis=1)
     far = np.abs(table[:, 0] - np.median(table[:, 0])) > DAY
     far &= far.mean() < STRAY
     blank = without_stamp(table[:, 1])
@@ -165,8 +172,9 @@ def _usable(
                              f"{OPTIONS[stream]}.")
         raise ValueError(f"{path}: topic {topic}: the orientation is all zero, which is no quaternion. Record a "
                          f"topic with an orientation, or leave this one out: {OPTIONS[stream]} ''.")
+    odd = "without a wheel" if kind == "JointState" else "with an orientation that is all zero"
     notes += [f"{topic}: {which.sum()} messages {what} are left out" for which, what in (
-        (unset, "with an orientation that is all zero"), (~finite & ~unset, "with numbers that are not finite"),
+        (unset, odd), (~finite & ~unset, "with numbers that are not finite"),
         (finite & far, "whose time is more than a day from the others'"),
         (finite & ~far & blank, "with a header stamp of zero, though the others have one,")) if which.any()]
     return table[finite & ~far & ~blank]

@@ -44,16 +44,24 @@ def chair_odometry(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: 
 
 
 def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
-    """(T, 2) v and omega of wheels: rows (T, 4) of left and right angle [rad] and rate [rad/s], or nan for rates."""
+    """(T, 2) v and omega of wheels: rows (T, 4) of left and right angle [rad] and rate [rad/s], one of them nan where
+    it was not given, as `usable_joints` leaves them."""
     rates = rows[:, 2:]
     if not np.isfinite(rates).all():
         rates = np.gradient(np.column_stack([without_wraps(angle) for angle in rows[:, :2].T]), t, axis=0)
     return np.column_stack(twist_of_wheels(rates[:, 0], rates[:, 1], wheel_radius, track))
 
 
+def usable_joints(rows: np.ndarray) -> np.ndarray:
+    """Which rows (T, 4) of angles and rates show a motion (T,): those with rates, or with angles where most that have
+    these have no rates."""
+    angles, rates = (np.isfinite(part).all(axis=1) for part in (rows[:, :2], rows[:, 2:]))
+    return angles if (angles & ~rates).sum() > rates.sum() else rates
+
+
 def joint_row(state: Any) -> tuple[float, float, float, float]:
-    """Left and right angle and rate, means over a side, of a JointState's wheels by their joints' names; inf without
-    any."""
+    """Left and right angle and rate, means over a side, of a JointState's wheels by their joints' names: nan where
+    the message has none, inf without any."""
     sides = wheel_joints(state.name)
     if sides is None:
         return (float("inf"),) * 4
@@ -61,8 +69,7 @@ def joint_row(state: Any) -> tuple[float, float, float, float]:
     def mean(values: Sequence[float], side: int) -> float:
         return float(np.mean([values[k] for k in sides[side]])) if len(values) == len(state.name) else float("nan")
 
-    row = mean(state.position, 0), mean(state.position, 1), mean(state.velocity, 0), mean(state.velocity, 1)
-    return (row[0] if row[0] == row[0] else 0.0, row[1] if row[1] == row[1] else 0.0, row[2], row[3])
+    return mean(state.position, 0), mean(state.position, 1), mean(state.velocity, 0), mean(state.velocity, 1)
 
 
 def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]] | None:
