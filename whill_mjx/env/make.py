@@ -61,8 +61,7 @@ def make_env(
 
     Raises:
         ValueError: unknown task, layout, vehicle, looks or sensor; a method of the task that fails or returns something
-            else than it must; a share that is none; rich looks of a task that has
-            no lane to furnish.
+            else than it must; a share that is none; rich looks of a task without a lane.
     """
     task = make_task(task) if isinstance(task, str) else task
     if not isinstance(task, Task):
@@ -71,10 +70,7 @@ def make_env(
         task = dataclasses.replace(task, layout=layout)
     check_task(task)
     spec, params = as_vehicle(vehicle)
-    task, asked = task.for_vehicle(spec), task
-    if not isinstance(task, Task):
-        raise ValueError(f"task {asked.name!r}: for_vehicle: returns {type(task).__name__}; it must be a Task. Correct "
-                         "the method.")
+    task = _for_vehicle(task, spec)
     chosen = task.observations() if observations is None else observations
     if looks is not None:
         random_looks = photometric = None
@@ -92,6 +88,15 @@ def make_env(
     )
     _check_own(env, params)
     return env, params
+
+
+def _for_vehicle(task: Task, spec: VehicleSpec) -> Task:
+    """The task as a vehicle of this size needs it."""
+    fitting = task.for_vehicle(spec)
+    if not isinstance(fitting, Task):
+        raise ValueError(f"task {task.name!r}: for_vehicle: returns {type(fitting).__name__}; it must be a Task. "
+                         "Correct the method.")
+    return fitting
 
 
 def _check_own(env: Env, params: VehicleParams) -> None:

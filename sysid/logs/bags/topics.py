@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sysid.logs.bags import transforms
@@ -82,16 +82,9 @@ def choose_topics(
         if wheels and stream == "odometry":
             continue
         if stream in asked:
-            topic = asked[stream]
-            if not topic:
-                continue
-            if topic not in known:
-                raise ValueError(f"{path}: no topic {topic!r} (topics with messages: {listing}). Correct "
-                                 f"{OPTIONS[stream]}.")
-            if short_type(known[topic]) not in types[stream]:
-                raise ValueError(f"{path}: topic {topic} is {known[topic]}; {stream} must be one of "
-                                 f"{', '.join(types[stream])}. Name another topic with {OPTIONS[stream]}.")
-            chosen[stream] = topic
+            if topic := asked[stream]:
+                _check_asked(path, known, stream, topic, types[stream])
+                chosen[stream] = topic
             continue
         usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
         fitting = [name for name, kind in known.items() if short_type(kind) in TYPES[stream]
@@ -124,6 +117,16 @@ def choose_topics(
     if "command" not in chosen:
         raise ValueError(f"{path}: --command-topic is empty; a trial needs its commands. Name their topic.")
     return chosen
+
+
+def _check_asked(path: Path, known: Mapping[str, str], stream: str, topic: str, types: Sequence[str]) -> None:
+    """Refuse a topic that was named for a stream where the bag lacks it, or its type cannot be the stream."""
+    if topic not in known:
+        raise ValueError(f"{path}: no topic {topic!r} (topics with messages: {listed(known)}). Correct "
+                         f"{OPTIONS[stream]}.")
+    if short_type(known[topic]) not in types:
+        raise ValueError(f"{path}: topic {topic} is {known[topic]}; {stream} must be one of {', '.join(types)}. Name "
+                         f"another topic with {OPTIONS[stream]}.")
 
 
 def _truths(known: Mapping[str, str], asked: Mapping[str, str]) -> list[str]:
