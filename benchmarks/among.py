@@ -74,8 +74,8 @@ class Options:
     """Real maps of the training, or made:SEED."""
     unseen: tuple[str, ...] = UNSEEN
     """Maps of the test."""
-    made: Annotated[int, Range(0, 1000)] = 8
-    """Made floor plans that the training has besides."""
+    made: Annotated[int, Range(0, 60)] = 8
+    """Made floor plans that the training has besides; all maps lie in one row, which may be 4 km long."""
     minutes: Annotated[float, Range(0.0, 1000.0, above=True)] = 3.3
     """Time of each training, without its compilation; the step size falls to zero over it."""
     instances: Annotated[int, COUNT] = 4096

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 Heard = tuple[float, float, float]
 """Steady time of receipt [s], v [m/s], omega [rad/s]."""
 
@@ -26,8 +27,14 @@ def message_type(name: str) -> Any:
 
 
 def environment_of(domain: int) -> dict[str, str]:
-    """Return the environment of processes on a domain; they find those of this computer where it says nothing else."""
-    return {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **os.environ, "ROS_DOMAIN_ID": str(domain)}
+    """Return the environment of processes on a domain of this computer."""
+    return {**os.environ, RANGE: discovery_range(), "ROS_DOMAIN_ID": str(domain)}
+
+
+def discovery_range() -> str:
+    """Return how far nodes look: on this computer alone, unless a profile of Fast DDS is given, as by the tests."""
+    own = "FASTRTPS_DEFAULT_PROFILES_FILE" in os.environ
+    return os.environ.get(RANGE, "SYSTEM_DEFAULT") if own else "LOCALHOST"
 
 
 class Switch:
@@ -52,9 +59,15 @@ class Robot:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
 
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        before = os.environ.get(RANGE)
+        os.environ[RANGE] = discovery_range()
         self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=domain)
+        try:
+            rclpy.init(context=self.context, domain_id=domain)
+        finally:
+            del os.environ[RANGE]
+            if before is not None:
+                os.environ[RANGE] = before
         self.node = rclpy.create_node(name, context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)

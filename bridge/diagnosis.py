@@ -160,7 +160,7 @@ def input_cause(name: str, topic: str, kind: str, publishers: list[Endpoint], st
         now: steady time [s].
     """
     if len(fitting(publishers, kind)) > 1:  # it holds the vehicle, whatever else is sent there
-        return _mixed(topic, fitting(publishers, kind), "messages")
+        return mixed(topic, fitting(publishers, kind), "messages")
     wrong = sorted({one.type for one in publishers} - {kind})
     if wrong:
         return f"{topic} carries {', '.join(wrong)}, and the policy's {name} is a {kind}: remap it to the right topic"
@@ -188,7 +188,7 @@ def is_mixed(publishers: Mapping[str, list[Endpoint]], kinds: Mapping[str, str])
     return any(len(fitting(publishers[name], kind)) > 1 for name, kind in kinds.items())
 
 
-def _mixed(topic: str, publishers: list[Endpoint], what: str) -> str:
+def mixed(topic: str, publishers: list[Endpoint], what: str) -> str:
     """Return what is wrong where several nodes publish on the topic of an input."""
     names = ", ".join(sorted(one.node for one in publishers))
     return f"{topic} has {len(publishers)} publishers ({names}): their {what} mix; stop or remap all but one"
@@ -207,7 +207,7 @@ def _camera_causes(evidence: Evidence) -> list[str]:
         found.append(f"no publisher on {topic}: start the {evidence.sensor}, or compare ROS_DOMAIN_ID and the topic "
                      "name")
     if len(cameras) > 1:
-        found.append(_mixed(topic, cameras, "images" if evidence.sensor == "camera" else "messages"))
+        found.append(mixed(topic, cameras, "images" if evidence.sensor == "camera" else "messages"))
     if not cameras or evidence.frames.count or not evidence.settled:
         return found
     if evidence.incompatible:

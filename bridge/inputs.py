@@ -40,8 +40,8 @@ class SafetyInputs:
     def __init__(self, supervisor: Supervisor, options: argparse.Namespace) -> None:
         """Set the inputs in force; `options` are those that `add_options` declares."""
         self.supervisor, self.options = supervisor, options
-        self.topics: list[str] = []
-        """What is subscribed to, before remapping."""
+        self.topics: dict[str, str] = {}
+        """What is subscribed to, before remapping, with the type of its messages."""
         self._e_stop, self._enable, self._button = (Signal(options.signal_age) for _ in range(3))
 
     def on_e_stop(self, now: float, pulled: bool) -> None:
@@ -84,7 +84,7 @@ class SafetyInputs:
         from std_msgs.msg import Bool
 
         def listen(topic: str, take: Callable[[float, bool], None]) -> None:
-            self.topics.append(topic)
+            self.topics[topic] = "std_msgs/msg/Bool"
 
             def heard(message: Any) -> None:
                 now = clock()
@@ -107,7 +107,7 @@ class SafetyInputs:
                 self.on_joy(now, list(message.buttons))
                 changed(now)
 
-            self.topics.append(ros.JOY_TOPIC)
+            self.topics[ros.JOY_TOPIC] = "sensor_msgs/msg/Joy"
             node.create_subscription(Joy, ros.JOY_TOPIC, on_joy, ros.best_effort())
 
 

@@ -102,12 +102,6 @@ def subscription_events(**callbacks: Any) -> Any:
     return SubscriptionEventCallbacks(**callbacks)
 
 
-def publishers_of(node: Any, topic: str) -> list[str]:
-    """Return the full names of the nodes that publish on a topic, which is resolved first."""
-    infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-    return sorted(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos)
-
-
 def subscribe_own(node: Any, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> None:
     """Subscribe to a topic between the bridge's own nodes, without the events that warn of unfit publishers."""
     node.create_subscription(kind, topic, callback, profile,

@@ -11,13 +11,14 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 from bridge import inputs, ros
 from bridge.bases import BASES
-from bridge.commands import Commanders, CommandTopic, Ear, Endpoint
+from bridge.commands import Commanders, CommandTopic, Ear, Endpoint, endpoints
+from bridge.diagnosis import fitting, mixed
 from bridge.exits import OptionError
 from bridge.guard import BEAT_PERIOD, GuardLink
 from bridge.joystick_lock import JoystickLock
@@ -241,10 +242,7 @@ class VehicleNode:
         self.commands.look()
         self._listeners = self.commands.listeners()
         self.supervisor.block(NO_BASE, not any(map(self.commands.hears_us, self._listeners)))
-        publishers = {topic: ros.publishers_of(self.node, topic) for topic in self._inputs.topics}
-        self._mixed = [f"{self.node.resolve_topic_name(topic)} has {len(names)} publishers ({', '.join(names)}): the "
-                       "bridge cannot know whose value it hears; let one node publish for all"
-                       for topic, names in publishers.items() if len(names) > 1]
+        self._mixed = [mixed(topic, found, "values") for topic, found in self._signals() if len(found) > 1]
         self.supervisor.block(MIXED_SIGNALS, bool(self._mixed))
         self._others.look(now, self.commands.commanders())
         self._commanders = self._others.names(now)
@@ -253,6 +251,12 @@ class VehicleNode:
         self.supervisor.block(LOOKING, alone and not self.supervisor.may_drive and not self._others.settled(now))
         if (self.supervisor.state.value, self.supervisor.reason) != self._reported[:2]:
             self._on_status()
+
+    def _signals(self) -> Iterator[tuple[str, list[Endpoint]]]:
+        """The topics of the safety signals, each with those who publish what is read there."""
+        for name, kind in self._inputs.topics.items():
+            topic = self.node.resolve_topic_name(name)
+            yield topic, fitting(endpoints(self.node.get_publishers_info_by_topic(topic)), kind)
 
     def _on_status(self) -> None:
         self._said = time.monotonic()

@@ -216,9 +216,7 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     changes |= read_fields(task, options.set)
     if options.layout is not None:
         changes["layout"] = options.layout
-    task = make_task(name, **changes)
-    check_world(task)
-    return task
+    return make_task(name, **changes)
 
 
 def chosen_sweeps(options: EvaluateOptions, task: Task) -> list[str]:

@@ -68,11 +68,12 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         raise ValueError(f"--log {options.log}: nothing is fitted to it, since --vehicle is given. Leave one out.")
     if options.log is not None and not options.log.exists():
         raise FileNotFoundError(f"--log {options.log}: no such dataset. Correct the path.")
+    vehicle: Any = options.vehicle
     if options.log is not None:
         from sysid import load_any
 
-        load_any(options.log)
-    env, params = make_env(preset.task, options.vehicle, looks=preset.looks)
+        vehicle = load_any(options.log).spec
+    env, params = make_env(preset.task, vehicle, looks=preset.looks)
     check_world(env.task)  # of this vehicle, which a map may not have room for
     check_memory(preset, options.learner, env)
     check_learner(preset, options.learner, make_batch(env, params, preset.instances))

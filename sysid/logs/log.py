@@ -39,6 +39,7 @@ START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command 
 SLOWEST = 4.0  # s between rows that no log has in all of its streams
 LEAST_ROWS = 10  # of a stream to be asked for its rate
 LONGER = 200.0  # times that one stream of a trial lasts as long as another, which no recording does
+STANDS = 1e-4  # m and rad by which a pose changes from row to row while the vehicle stands, at most
 LEAST_WAY, WAY_POINTS = 0.3, 100  # m or rad that poses show, and how many of them are looked at
 DOUBTED = 0.5  # s between rows, above which t may be in milliseconds as well: its rows come at below 2 kHz then
 UNLIKE = 3.0  # factor by which the way by the speeds differs from that of the poses at most, in the right unit of time
@@ -248,6 +249,9 @@ def _check_way(path: Path, stream: OdometryStream | PoseStream, speeds: Odometry
         return
     if not DOUBTED <= float(np.median(np.diff(stream.t))) <= SLOWEST:
         return
+    steps = np.hypot(np.diff(stream.x), np.diff(stream.y)), np.abs(np.diff(np.unwrap(stream.yaw)))
+    if all(float(np.median(one)) < STANDS for one in steps):
+        return  # most of the time the vehicle stood, which explains the short way
     few = np.linspace(0, len(stream.t) - 1, min(len(stream.t), WAY_POINTS)).astype(int)  # noise adds up in many
     way = float(np.hypot(np.diff(stream.x[few]), np.diff(stream.y[few])).sum())
     turn = float(np.abs(np.diff(np.unwrap(stream.yaw)[few])).sum())

@@ -6,7 +6,7 @@ import numpy as np
 
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 TURN = 2 * np.pi * 1.02  # rad of an angle that wraps at a turn, with some noise
-OVERFLOW = 0.9  # share of all that an encoder counts by which it changes at once where its counter overflows
+RESET = 10.0  # times the 99th percentile of its steps by which an encoder changes where its counter begins anew
 
 
 def yaw_of(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -32,11 +32,11 @@ def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) ->
 
 def without_wraps(angle: np.ndarray) -> np.ndarray:
     """Angle (T,) of a wheel [rad] that goes on over turns. One that leaves a turn does so already, however far it gets
-    between two samples; but a counter of many turns may overflow."""
-    if np.ptp(angle) <= TURN:
+    between two samples; but a counter of many turns may overflow, or begin anew with its driver."""
+    if np.subtract(*np.percentile(angle, (99, 1))) <= TURN:  # one odd sample does not make it a counter of turns
         return np.unwrap(angle)
     steps = np.diff(angle)
-    over = np.abs(steps) > OVERFLOW * np.ptp(angle)
+    over = np.abs(steps) > max(np.pi, RESET * float(np.percentile(np.abs(steps), 99)))
     if over.any() and not over.all():
         steps[over] = np.interp(np.flatnonzero(over), np.flatnonzero(~over), steps[~over])
     return np.concatenate([angle[:1], angle[0] + np.cumsum(steps)])

@@ -96,7 +96,7 @@ def _check_numbers(path: Path, top: ElementTree.Element) -> None:
         element, holder = waiting.pop()
         holder = element if element.get("name") else holder
         for name, text in element.items():
-            is_number = name in NUMBERS or (element.tag, name) == ("mass", "value")
+            is_number = element.tag != "flag" and name in NUMBERS or (element.tag, name) == ("mass", "value")
             if is_number and not all(map(_is_finite, text.split())):
                 what = name if element is holder else f"{name} of {element.tag}"
                 raise ValueError(f"{path}: {what} of {holder.tag} {holder.get('name', '')!r} is {shown(text)}; it must "

@@ -215,7 +215,7 @@ def swapped(path: Path, spec: Any, wheels: Sequence[str], joints: Sequence[str])
     if len(wheels) != 2 or targets.get(wheels[0], wheels[0]) == joints[0]:
         return []
     return [f"{path.name}: --wheels names {wheels[0]} first, but {joints[0]} is on the left, with x ahead: it is taken "
-            "for the left one"]
+            "for the left one. Where the robot's front is -x, turn its first body by 180 degrees in the file"]
 
 
 def _paired(path: Path, spec: Any, wheels: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:

@@ -266,9 +266,12 @@ def test_outside_pose_is_never_guessed_and_can_be_left_out(bag, tmp_path):
     assert log.trials[0].ground_truth is None and log.trials[0].odometry is not None
 
 
-@pytest.mark.parametrize("truth", ["/robot/ground_truth/state", "/base_pose_ground_truth", "/robot/odom_gt",
-                                   "/mocap/rigid_body/odom", "/OptiTrack/robot", "/true_odom"])
-@pytest.mark.parametrize("own", ["/robot/odom", ""])
+TRUTHS = ("/robot/ground_truth/state", "/base_pose_ground_truth", "/robot/odom_gt", "/true_odom")
+TRACKED = ("/mocap/rigid_body/odom", "/OptiTrack/robot")
+
+
+@pytest.mark.parametrize(("truth", "own"), [*((one, "/robot/odom") for one in TRUTHS),
+                                            *((one, "") for one in (*TRUTHS, *TRACKED))])
 def test_a_topic_whose_name_says_truth_is_never_the_vehicles_odometry(tmp_path, truth, own):
     bag = write_bag(tmp_path / "bag", topics=("/robot/cmd_vel", own, truth))
     log, notes = convert(ConvertConfig(bag, tmp_path / "log"))
@@ -276,6 +279,20 @@ def test_a_topic_whose_name_says_truth_is_never_the_vehicles_odometry(tmp_path, 
     assert any(f"ground_truth is taken from {truth}" in note and "--truth-topic ''" in note for note in notes)
     assert trial.ground_truth.x[0] == pytest.approx(0.0, abs=0.02)  # the odometry's own begins at 3 m
     assert any(f"odometry is taken from {own}" in note for note in notes) if own else trial.odometry is None
+
+
+@pytest.mark.parametrize("tracked", TRACKED)
+def test_a_tracked_body_beside_the_vehicles_odometry_may_be_another_one_and_is_not_taken_unasked(tmp_path, tracked):
+    bag = write_bag(tmp_path / "bag", topics=("/robot/cmd_vel", "/robot/odom", tracked))
+    log, notes = convert(ConvertConfig(bag, tmp_path / "log"))
+    assert log.trials[0].ground_truth is None and log.trials[0].odometry is not None
+    assert any(f"{tracked} may be one: --truth-topic {tracked}" in note for note in notes)
+
+
+def test_a_namespace_that_says_truth_hides_no_commands(tmp_path):
+    bag = write_bag(tmp_path / "bag", topics=("/gt/cmd_vel", "", "/gt/odom"))
+    log, _ = convert(ConvertConfig(bag, tmp_path / "log"))
+    assert log.trials[0].ground_truth is not None and np.ptp(log.trials[0].command.v) > 0
 
 
 def test_of_several_topics_that_say_truth_none_is_taken_unasked_and_the_first_can_be_named(tmp_path):
@@ -528,16 +545,16 @@ def test_a_bag_whose_recorder_was_killed_is_read_by_the_name_of_its_folder(bag, 
         convert(ConvertConfig(tmp_path / "packed", tmp_path / "other"))
 
 
-@pytest.mark.parametrize(("name", "trial"), [("circle_2/circle_2_0.db3", "circle_2"),
-                                             ("renamed/circle_2_0.db3", "circle_2_0")])
-def test_a_recording_that_was_killed_is_read_beside_those_that_were_closed(bag, tmp_path, name, trial):
+@pytest.mark.parametrize(("name", "trials"), [("circle_2/circle_2_0.db3", ["circle_1", "circle_2"]),
+                                              ("old/failed.db3", ["circle_1"])])
+def test_a_recording_that_was_killed_is_read_beside_those_that_were_closed(bag, tmp_path, name, trials):
     shutil.copytree(bag, tmp_path / "bags" / "circle_1")
     killed = tmp_path / "bags" / name
     killed.parent.mkdir()
     shutil.copy(next(bag.glob("*.db3")), killed)
     (tmp_path / "bags" / "photos").mkdir()
     log, _ = convert(ConvertConfig(tmp_path / "bags", tmp_path / "log"))
-    assert [one.name for one in log.trials] == ["circle_1", trial]
+    assert [one.name for one in log.trials] == trials
 
 
 def test_recordings_that_were_all_killed_are_read_by_the_names_of_their_folders(bag, tmp_path):

@@ -13,8 +13,10 @@ from test_robots import BALL, CYLINDER, joint, link, robot_file, wheel
 from sysid.replay.mjcf import Stepped, mjcf_model
 from sysid.replay.robot_check import check_robot, describe_robot
 from sysid.replay.robot_drive import RobotDrive
+from sysid.replay.robot_files import read_robot
 from sysid.replay.robot_loading import load_robot
 from sysid.replay.robot_servos import is_stable
+from whill_mjx.vehicle.model import ASSET
 from whill_mjx.vehicle.parameters import get_values
 from whill_mjx.vehicle.specs import SPECS, in_proportion
 
@@ -194,3 +196,7 @@ def test_the_floor_that_is_added_lies_under_the_wheels_wherever_their_bodies_beg
     check = check_robot(robot)
     assert check.speed == pytest.approx(check_robot(usual).speed, rel=1e-3)
     assert robot.rest[2] - usual.rest[2] == pytest.approx(0.3, abs=1e-3)
+
+
+def test_flags_of_an_mjcf_have_the_names_of_numbers_and_are_none():
+    read_robot(ASSET)  # it has frictionloss="disable"

@@ -14,7 +14,7 @@ from whill_mjx.env.moments import view_of
 from whill_mjx.env.records import Env
 from whill_mjx.sensors.base import Sensor, as_sensors, check_sensor
 from whill_mjx.sensors.registry import known_sensors
-from whill_mjx.tasks.check import check_task
+from whill_mjx.tasks.check import check_task, fitted_task
 from whill_mjx.tasks.tasks import Task, make_task
 from whill_mjx.vehicle.model import build_model
 from whill_mjx.vehicle.presets import preset_params
@@ -68,9 +68,9 @@ def make_env(
         raise ValueError(f"task is {task!r}; give a Task such as Corridor(), or the name of one.")
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
-    check_task(task)
     spec, params = as_vehicle(vehicle)
-    task = _for_vehicle(task, spec)
+    task = fitted_task(task, spec)
+    check_task(task)
     chosen = task.observations() if observations is None else observations
     if looks is not None:
         random_looks = photometric = None
@@ -88,15 +88,6 @@ def make_env(
     )
     _check_own(env, params)
     return env, params
-
-
-def _for_vehicle(task: Task, spec: VehicleSpec) -> Task:
-    """The task as a vehicle of this size needs it."""
-    fitting = task.for_vehicle(spec)
-    if not isinstance(fitting, Task):
-        raise ValueError(f"task {task.name!r}: for_vehicle: returns {type(fitting).__name__}; it must be a Task. "
-                         "Correct the method.")
-    return fitting
 
 
 def _check_own(env: Env, params: VehicleParams) -> None:

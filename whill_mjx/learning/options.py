@@ -75,7 +75,7 @@ class TrainOptions:
     """Share of training episodes that begin at a random free place on the way to the goal, which the simulator can do
     and a real course cannot; evaluations always begin at the start. None takes the preset's."""
     second_tries: Annotated[float | None, SHARE] = None
-    """Share of the training episodes without an arrival after which the same world is begun again, which a simulator
+    """Share of the training episodes without a success after which the same world is begun again, which a simulator
     can do; evaluations never do. None takes the preset's."""
     spread: Annotated[float | None, Range(0, 1, below=True)] = None
     """Relative spread of all parameters of the vehicle from episode to episode of the training; none takes the

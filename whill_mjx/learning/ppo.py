@@ -261,7 +261,7 @@ def check_fit(env: Any, config: PpoConfig) -> None:
     if instances * config.rollout % config.minibatches:
         raise ValueError(
             f"{instances} instances x {config.rollout} steps do not split into {config.minibatches} minibatches; "
-            "change PpoConfig.rollout or minibatches."
+            "choose others with --change rollout=N or --change minibatches=N."
         )
 
 

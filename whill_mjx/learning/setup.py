@@ -210,9 +210,10 @@ def with_repeat(preset: Preset, repeat: int) -> Preset:
         batch_length=length,
         batch_size=max(1, round(learner.replayed_per_update / length)),
     )
-    baseline = dataclasses.replace(
-        preset.ppo, discount=preset.ppo.discount**factor, rollout=max(1, round(preset.ppo.rollout / factor))
-    )
+    batches = preset.ppo.minibatches
+    unit = batches // math.gcd(batches, preset.instances)  # of steps that all instances together can split
+    rollout = unit * max(1, round(preset.ppo.rollout / factor / unit))
+    baseline = dataclasses.replace(preset.ppo, discount=preset.ppo.discount**factor, rollout=rollout)
     return dataclasses.replace(
         preset,
         task=task,

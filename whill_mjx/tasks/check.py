@@ -20,10 +20,11 @@ from whill_mjx.sensors.base import as_sensors
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.base import Budget, Task, World
 from whill_mjx.tasks.terms import Moment
+from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.world.people.contact import scene_with_people
 from whill_mjx.world.scene import Footprint
 
-METHODS = ("sample_world", "goal", "rewards", "endings", "observations")
+METHODS = ("sample_world", "populate", "for_vehicle", "goal", "rewards", "endings", "observations")
 """What a task may define itself."""
 NAME = re.compile("[A-Za-z][A-Za-z0-9_]{0,63}")
 """Of a task: part of file names, of Gymnasium's ids and of run.json."""
@@ -56,6 +57,17 @@ def check_task(task: Task) -> None:
     _check_scalars(task, "rewards", moment, "numbers", lambda dtype: not jnp.issubdtype(dtype, jnp.complexfloating))
     _check_scalars(task, "endings", moment, "flags (True or False)", lambda dtype: jnp.issubdtype(dtype, jnp.bool_))
     _check_observations(task)
+
+
+def fitted_task(task: Task, spec: VehicleSpec) -> Task:
+    """The task as a vehicle needs it; ValueError where its method fails or returns something else."""
+    try:
+        fitting = task.for_vehicle(spec)
+    except (Exception, SystemExit) as error:
+        raise _failed(task, "for_vehicle", error) from error
+    if not isinstance(fitting, Task):
+        raise _wrong(task, "for_vehicle", f"returns {_named(fitting)}", "a Task")
+    return fitting
 
 
 def check_name(task: Task) -> None:

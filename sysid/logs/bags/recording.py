@@ -64,15 +64,14 @@ def is_bag(path: Path) -> bool:
 def find_bags(source: Path) -> list[Path]:
     """The recordings at a path or directly under it, in order of their names; empty where there is none.
 
-    A folder under it without metadata.yaml, whose recorder was killed, counts by its files: where they are named after
-    it, or recordings lie beside it.
+    A folder under it without metadata.yaml, whose recorder was killed, counts by its files that are named after it.
     """
     if is_bag(source) or not source.is_dir():
         return [source] if is_bag(source) else []
     entries = sorted(source.iterdir())
     bags = [path for path in entries if is_bag(path)]
     killed = [file for folder in entries if folder.is_dir() and not is_bag(folder) for file in sorted(folder.iterdir())
-              if file.is_file() and is_bag(file) and (bags or re.match(rf"{re.escape(folder.name)}_\d+\.", file.name))]
+              if file.is_file() and is_bag(file) and re.match(rf"{re.escape(folder.name)}_\d+\.", file.name)]
     return sorted([*bags, *killed])
 
 

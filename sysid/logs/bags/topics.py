@@ -88,12 +88,14 @@ def choose_topics(
             continue
         usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
         fitting = [name for name, kind in known.items() if short_type(kind) in TYPES[stream]
-                   and name not in (*chosen.values(), *asked.values())
-                   and (stream == "ground_truth" or not from_outside(name))]
+                   and name not in (*chosen.values(), *asked.values())]
+        inside = [name for name in fitting if not from_outside(name)]
+        if stream != "ground_truth":  # a namespace such as /gt is of all topics; no odometry is measured from outside
+            fitting = inside if stream == "odometry" else inside or fitting
         fitting = [name for name in fitting if short_type(known[name]) != "JointState"] or fitting
         if usual:
             chosen[stream] = usual[0]
-        elif stream == "ground_truth" and len(truths) == 1:
+        elif stream == "ground_truth" and len(truths) == 1 and (TRUTH.search(truths[0]) or "odometry" not in chosen):
             chosen[stream] = truths[0]
             notes.append(f"{stream} is taken from {truths[0]}, as its name says that it is measured from outside. If "
                          f"it is not, leave it out: {OPTIONS[stream]} ''")

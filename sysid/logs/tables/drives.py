@@ -46,13 +46,14 @@ def read_drives(
     groups: list[tuple[str, list[Table]]] = []
     refused: list[ValueError] = []
     for files in text_files(source):
-        tables = []
+        found = []
         for path in files:
             try:
-                alone = sum(other.stem == path.stem for other in files) == 1
-                tables.append(read_table(path) if alone else replace(read_table(path), stem=path.name))
+                found.append((path, read_table(path)))
             except ValueError as error:
                 refused.append(error)
+        stems = [path.stem for path, _ in found]
+        tables = [one if stems.count(path.stem) == 1 else replace(one, stem=path.name) for path, one in found]
         if not tables:
             continue
         whole = tables if source.is_file() else [table for table in tables if _is_whole(table)]

@@ -11,7 +11,7 @@ from sysid.logs.planar import yaw_of
 from sysid.logs.tables.columns import UNITS, Column, is_unit_of, kind_of, size_of
 
 FASTEST_STEP, SLOWEST_STEP = 5e-4, 4.0  # s; rows that follow faster, or slower, are in another unit of time
-SHORTEST = 1.0  # s; a recording that would be shorter is in a larger unit
+SHORTEST = 10.0  # s; a recording that would be shorter is in a larger unit
 DATES = (1e9, 1e10)  # s since 1970
 SERIAL_DAYS, DAY_STEP = ((2e4, 6e4), (7.2e5, 7.6e5)), 5e-5
 """Ranges of dates that count days, as spreadsheets and MATLAB have them, and the longest step of such a recording."""
@@ -22,7 +22,7 @@ FULL_TURN = 0.9  # of it, beyond which the step between two rows is that of a he
 ALONG, CLEARER = 0.5, 4.0
 """How well a heading follows the path (1 is exactly), at least, and how many times less well that of another unit."""
 STEPPED = 0.5  # s over which a path has a direction
-FOLLOWED, SLIPPED = 0.5, 3.0  # correlation of the turns with a yaw rate, and the factor by which they may be another's
+FOLLOWED, SLIPPED = 0.5, 7.0  # correlation of the turns with a yaw rate, and the factor by which they may be another's
 ALIKE = 0.25  # relative difference from a unit's size within which numbers agree with it
 LARGEST_SI = 4.0  # m/s and rad/s that speeds of a vehicle usually stay below
 BUSY = 0.3  # of its usual largest, above which a signal is compared: a vehicle may turn seldom

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 FREE, UNKNOWN, OCCUPIED = 0, 1, 2
-NEAR, FARTHEST = 1000.0, 4096.0
+STAYS, FARTHEST = 1000.0, 4096.0
 """Coordinates up to which a map stays where its file has it, and beyond which nothing drives [m]. Poses are in single
 precision: `docs/maps.md` says what a drive loses there."""
 
@@ -46,8 +46,8 @@ class GridMap:
         return float(np.abs(self._corners()).max())
 
     def brought_near(self) -> GridMap:
-        """The grid with its middle within a metre of zero where a corner lies beyond `NEAR`, else as it is."""
-        if self.farthest() <= NEAR:
+        """The grid with its middle within a metre of zero where a corner lies beyond `STAYS`, else as it is."""
+        if self.farthest() <= STAYS:
             return self
         x, y = (float(one) for one in np.rint(self._corners().mean(0)))
         origin = (self.origin[0] - x, self.origin[1] - y, self.origin[2])
