@@ -17,6 +17,10 @@ CHECK = "Check the log: "
 """Begins a note on a fault of a log."""
 
 
+CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}
+"""What a person calls a channel of a trial."""
+
+
 @dataclass(frozen=True)
 class Command:
     """Commanded velocities; each holds until the next."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.metrics import METRICS, UNITS
-from sysid.logs.records import CHECK
+from sysid.logs.records import CHANNEL_NAMES, CHECK
 from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import Channel, TrialSeries
 from whill_mjx.io.html import (
@@ -29,7 +29,6 @@ from whill_mjx.io.svg import COLOURS, PALETTE, Axes, Line, bar_chart, interval_b
 REPLAYS = ("ideal", "initial", "fitted")
 REPLAY_WORDS = {"ideal": "a vehicle that follows its commands at once", "initial": "the model before the fit",
                 "fitted": "the fitted vehicle"}
-CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}
 COLUMNS = {"ground_truth": ("along [m]", "left [m]", "yaw [rad]"),
            "odometry": ("along [m]", "left [m]", "yaw [rad]", "v [m/s]", "omega [rad/s]")}
 MAX_TRIALS = 12  # drawn one by one

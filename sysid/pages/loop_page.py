@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.metrics import METRICS, UNITS, integrate
-from sysid.logs.records import Start
+from sysid.logs.records import CHANNEL_NAMES, Start
 from sysid.pages.before_after import drive_pictures, drive_table
 from sysid.pages.loop_words import (
     another_floor,
@@ -28,7 +28,6 @@ from whill_mjx.logs.dataset import write_text
 
 METRIC_WORDS = {"trajectory": "position", "yaw": "heading", "velocity": "speed", "angular_velocity": "turning rate"}
 PART_WORDS = {"held_out": "Drives that no fit has seen", "training": "Drives that were fitted"}
-CHANNEL_WORDS = {"ground_truth": "outside pose", "odometry": "odometry"}
 SHOWN_UNITS = {"m": ("cm", 100.0), "rad": ("degrees", 180 / np.pi), "m/s": ("cm/s", 100.0),
                "rad/s": ("degrees/s", 180 / np.pi)}  # unit of a metric -> the one that is shown, and its factor
 
@@ -177,7 +176,7 @@ def errors(report: dict[str, Any]) -> str:
                 if report["alone"] is not None:
                     values.append(report["alone"][part][channel][metric])
                 least = floor.get(metric)
-                rows.append([f"{METRIC_WORDS[metric]}, {CHANNEL_WORDS[channel]} [{unit}]",
+                rows.append([f"{METRIC_WORDS[metric]}, {CHANNEL_NAMES[channel]} [{unit}]",
                              *(factor * value for value in values), None if least is None else factor * least,
                              f"{moved['trials'] - moved['worse']} of {moved['trials']}"])
         if rows:
@@ -195,7 +194,7 @@ def errors(report: dict[str, Any]) -> str:
 def by_manoeuvre(report: dict[str, Any]) -> str:
     """Errors of each manoeuvre, and which of them surely grew."""
     grown = [f"{row['manoeuvre']} ({PART_WORDS[row['part']].lower()}), {METRIC_WORDS[row['metric']]} of the "
-             f"{CHANNEL_WORDS[row['channel']]}: {row['before']:.3g} to {row['after']:.3g} {row['unit']}"
+             f"{CHANNEL_NAMES[row['channel']]}: {row['before']:.3g} to {row['after']:.3g} {row['unit']}"
              for row in report["worse"]]
     parts = ([paragraph("Surely worse than refitted without it:"), bullets(grown)] if grown else
              [paragraph("No manoeuvre is surely predicted worse than by the refitted vehicle without it.")])
@@ -204,7 +203,7 @@ def by_manoeuvre(report: dict[str, Any]) -> str:
         for row in report["by_manoeuvre"]:
             unit, factor = SHOWN_UNITS[row["unit"]]
             if row["part"] == part:
-                rows.append([row["manoeuvre"], f"{METRIC_WORDS[row['metric']]}, {CHANNEL_WORDS[row['channel']]} "
+                rows.append([row["manoeuvre"], f"{METRIC_WORDS[row['metric']]}, {CHANNEL_NAMES[row['channel']]} "
                              f"[{unit}]", factor * row["before"], factor * row["after"],
                              *(factor * end for end in row["interval"]), row["trials"]])
         if rows:

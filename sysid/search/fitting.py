@@ -18,7 +18,7 @@ from sysid.intervals import uncertainty
 from sysid.intervals.profiles import Minimum, Profile, check_names, profile
 from sysid.logs import odometry_frames
 from sysid.logs.log import of_file
-from sysid.logs.records import Log, Prediction, Trial
+from sysid.logs.records import CHANNEL_NAMES, Log, Prediction, Trial
 from sysid.logs.sources import refuse_recording
 from sysid.replay import models
 from sysid.replay.differences import DifferenceReplay, make_replay
@@ -37,8 +37,6 @@ from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
 
-CHANNELS = {"ground_truth": "outside pose", "odometry": "odometry"}
-"""What a person calls a channel."""
 PASSIVE = "slip_traction.mu_free"
 CENTRE = ("body.com_x", "body.com_y", "body.com_z")
 """Of a skid-steered robot they move the point about which it turns; to a log the tracked point's place is the same."""
@@ -226,7 +224,7 @@ def _training(log: Log, config: FitConfig) -> tuple[Trial, ...]:
     trials = tuple(_keep_channels(trial, config.channels) for trial in log.training if _has(trial, config.channels))
     if not trials:
         raise ValueError(f"--channels {config.channels}: no training trial of {log.name!r} has "
-                         f"{CHANNELS[config.channels]}. Leave the option out, or name the other channel.")
+                         f"{CHANNEL_NAMES[config.channels]}. Leave the option out, or name the other channel.")
     return trials
 
 
@@ -298,7 +296,7 @@ def subject(log: Log, config: FitConfig, model: Model | None = None) -> tuple[Lo
     log = of_earlier(log, config)
     without = [trial.name for trial in log.training if not _has(trial, config.channels)]
     if without:
-        channel = CHANNELS[config.channels]
+        channel = CHANNEL_NAMES[config.channels]
         note = f"--channels {config.channels}: {', '.join(without)} have no {channel} and are left out"
         log = log if note in log.notes else replace(log, notes=(*log.notes, note))
     if model is None and config.model:
