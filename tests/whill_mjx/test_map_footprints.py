@@ -277,6 +277,8 @@ HOLE = 5 * 4 - 0.1 * 9
     ([("outer", 1), ("outer", 2), ("inner", 3)], "multipolygon", 20.1 * 10.1 - HOLE),
     ([("", 1), ("outer", 2), ("inner", 3)], "multipolygon", 20.1 * 10.1 - HOLE),
     ([("outer", 4), ("", "node", 3)], "multipolygon", 20.1 * 10.1),
+    ([("", 4), ("", 3)], "multipolygon", 20.1 * 10.1 - HOLE),
+    ([("", 4), ("", 5), ("", 6)], "multipolygon", 20.1 * 10.1 + 10.1**2),
     ([("outer", 4), ("inner", "relation", 3)], "multipolygon", 20.1 * 10.1),
     ([("outline", 4), ("part", 3)], "building", 20.1 * 10.1),
     ([("outer", 4), ("outer", 4)], "multipolygon", 20.1 * 10.1),
@@ -289,6 +291,12 @@ def test_a_relation_is_its_outer_ways_without_its_inner_ones(tmp_path, members, 
         grid = load(tmp_path, town(order, WAYS, kind))
         assert area(grid) == pytest.approx(expected, abs=4.5)
         assert len(grid.notes) == 1
+
+
+def test_pieces_of_a_relation_and_deleted_ways_are_no_buildings_left_out(tmp_path):
+    text = town([("outer", 1), ("outer", 2)], [1, 2]).replace("</way>", '<tag k="building" v="yes"/></way>')
+    text = text.replace("<relation", '<way id="9" visible="false"><tag k="building" v="yes"/></way><relation')
+    assert len(load(tmp_path, text).notes) == 1  # how degrees became metres
 
 
 def test_a_relation_that_is_cut_off_leaves_no_building_of_its_courtyard(tmp_path):

@@ -27,18 +27,19 @@ def read_osm(root: ET.Element) -> tuple[list[list[np.ndarray]], list[str]]:
     }
     chosen: list[list[np.ndarray]] = []
     cut: list[str] = []
-    for way in root.iter("way"):
-        ring = ways.get(way.get("id"), [])
-        if _is_building(way) and _is_closed(ring):
+    pieces: set[str | None] = set()  # ways of relations, whose outlines stand for them
+    for relation in filter(_is_building, root.iter("relation")):
+        outlines, whole = _outlines(relation, ways)
+        chosen += outlines
+        pieces |= {one.get("ref") for one in relation.iter("member")}
+        if not whole:
+            cut.append(f"relation {relation.get('id')}")
+    for way in filter(_is_building, root.iter("way")):
+        name = way.get("id")
+        if _is_closed(ring := ways.get(name, [])):
             chosen.append([np.array(ring)])
-        elif _is_building(way):
-            cut.append(f"way {way.get('id')}")
-    for relation in root.iter("relation"):
-        if _is_building(relation):
-            outlines, whole = _outlines(relation, ways)
-            chosen += outlines
-            if not whole:
-                cut.append(f"relation {relation.get('id')}")
+        elif name in ways and name not in pieces:
+            cut.append(f"way {name}")
     shown = ", ".join(cut[:5]) + (f" and {len(cut) - 5} more" if len(cut) > 5 else "")
     return chosen, [f"borders of buildings that are not whole in the file, left out: {shown}"] if cut else []
 
@@ -65,11 +66,12 @@ def _outlines(relation: ET.Element, ways: dict[str | None, list[Place]]) -> tupl
     roles = {one.get("ref"): one.get("role", "") for one in relation.iter("member") if one.get("type") == "way"}
     outer, whole = _joined([ways.get(ref, []) for ref, role in roles.items() if role in OUTER])
     inner, _ = _joined([ways.get(ref, []) for ref, role in roles.items() if role == "inner"])
+    if not any(roles.values()):  # as old data has it: a ring within another one is its courtyard
+        inner = [ring for ring in outer if any(_is_around(other, ring) for other in outer)]
+        outer = [ring for ring in outer if not any(ring is one for one in inner)]
     outlines = [[ring] for ring in sorted(outer, key=_area)]
     for ring in inner:  # of the smallest outer ring around it; without such a ring it is nothing
-        point, area = _inner_point(ring), _area(ring)
-        around = (one for one in outlines if _area(one[0]) > area and _is_within(point, one[0]))
-        next(around, []).append(ring)
+        next((one for one in outlines if _is_around(one[0], ring)), []).append(ring)
     return outlines, whole
 
 
@@ -112,6 +114,11 @@ def _inner_point(ring: np.ndarray) -> tuple[float, float]:
     height = float(heights[:2].mean())
     met = _crossings(ring, height)
     return (float(met[:2].mean()) if len(met) else float(ring[0, 0])), height
+
+
+def _is_around(ring: np.ndarray, other: np.ndarray) -> bool:
+    """Whether a ring is larger than another one that lies in it."""
+    return _area(ring) > _area(other) and _is_within(_inner_point(other), ring)
 
 
 def _is_within(point: tuple[float, float], ring: np.ndarray) -> bool:
