@@ -312,7 +312,7 @@ def test_two_effects_that_move_one_parameter_add_up():
 
 @pytest.mark.quick
 def test_replicates_are_driven_round_by_round_of_a_session():
-    """Only where the supply drains does it matter when a drive began; a drive of which nothing says it keeps its time."""
+    """Only where the supply drains does it matter when a drive began; where nothing says it, the time is kept."""
     drives = SimpleNamespace(names=(DRAIN, SESSION), began=np.array([0.5 * ROUND, 2.5 * ROUND, np.nan]))
     drained, fresh = (Drives._in_session(drives, np.array([[drain, 7.0]] * 3), np.arange(3)) for drain in (1e-3, 0.0))
     np.testing.assert_allclose(drained[:, 1], [0.5 * ROUND, 2.5 * ROUND, 7.0])
