@@ -214,7 +214,7 @@ def _in_proportion(name: str, about: Parameter, spec: VehicleSpec) -> tuple[floa
     times = growth(about.unit, spec.mass, spec.wheel_radius)
     if times == 1.0:
         return about.low, about.high
-    file = parameter_field(name, about.unit, about.low, about.high, about.neutral)
+    file = parameter_field(name, about.unit, about.low, about.high, about.neutral, (spec.mass, spec.wheel_radius))
     low, high = file.low + ROUNDING * abs(file.low), file.high - ROUNDING * abs(file.high)
     return max(times * about.low, low), min(times * about.high, high)
 

@@ -14,6 +14,7 @@ from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.vehicle.dynamics import place, substep
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.vehicle.model import build_model
+from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset, preset_params
 from whill_mjx.vehicle.specs import HUSKY, SPECS, CameraMount
 from whill_mjx.vehicle.types import VehicleParams, parameters_of
@@ -257,3 +258,13 @@ def test_a_turned_mount_looks_where_it_says():
 def test_every_camera_sits_on_its_vehicle(spec):
     assert abs(spec.camera.x) <= spec.body_length / 2 + 0.05
     assert spec.camera.z + spec.wheel_radius <= spec.body_height + 0.2
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("torque_drive.limit", 1e6), ("torque_drive.kp", 1e6), ("body.yaw_inertia", 1e6), ("body.mass", 40_000.0),
+])  # fmt: skip
+def test_what_a_lorry_may_have_is_refused_of_a_chair(tmp_path, name, value):
+    spec, params = preset("whill_cr_physical")
+    path = save_vehicle(tmp_path / "vehicle.toml", spec, set_values(params, [name], jnp.asarray([value])))
+    with pytest.raises(ValueError, match=f"{name} is {value:.10g}.*it must be positive"):
+        load_vehicle(path)

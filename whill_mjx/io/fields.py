@@ -318,7 +318,7 @@ the radius of its wheels."""
 
 RANGES: dict[str, tuple[float, float]] = {
     "body.mass": (SIZE["mass"].low, SIZE["mass"].high),
-    "body.yaw_inertia": (1e-9, 1e7),
+    "body.yaw_inertia": (1e-6, 1e5),  # of the chair
     **dict.fromkeys(("body.com_x", "body.com_y", "body.com_z"), (-20.0, 20.0)),
     **dict.fromkeys(
         ("actuator_lag.cascade", "axle_pivot.freedom", "command_expiry.loss", "rolling_contact.grip",
@@ -341,20 +341,28 @@ def growth(unit: str, mass: float, wheel_radius: float) -> float:
     return float((mass / CHAIR[0]) ** powers[0] * (wheel_radius / CHAIR[1]) ** powers[1])
 
 
-def parameter_field(name: str, unit: str, low: float, high: float, neutral: float) -> Field:
+def parameter_field(
+    name: str, unit: str, low: float, high: float, neutral: float, sizes: tuple[float, float] | None = None
+) -> Field:
     """The field of a parameter of a vehicle: ten times beyond the range that a fit may search, and the neutral value.
 
-    What grows with the vehicle may be as small as on the smallest one and as large as on the largest one (`SIZES`).
+    What grows with the vehicle may be a hundred times beyond what it is on the chair and on the vehicle itself.
 
     Args:
         name: dotted, such as "pid_drive.kp".
         unit, low, high, neutral: of its `Parameter`.
+        sizes: mass [kg] and wheel radius [m] of the vehicle; None, where it is not known, allows what the smallest
+            and the largest one (`SIZES`) may have.
     """
     mass, radius = SIZE["mass"], SIZE["wheel_radius"]
-    smaller, larger = sorted((growth(unit, mass.low, radius.low), growth(unit, mass.high, radius.high)))
-    reach = 10.0 * larger * max(abs(low), abs(high))
-    lowest, highest = (-reach if low < 0 else low * smaller / 10.0), (reach if high > 0 else 0.0)
+    ends = [(mass.low, radius.low), (mass.high, radius.high)] if sizes is None else [CHAIR, sizes]
+    smaller, larger = sorted(growth(unit, *end) for end in ends)
+    beyond = 100.0 if unit in GROWTH else 10.0  # a fit searches these around where it starts, which may be anywhere
+    reach = beyond * larger * max(abs(low), abs(high))
+    lowest, highest = (-reach if low < 0 else low * smaller / beyond), (reach if high > 0 else 0.0)
     lowest, highest = RANGES.get(name, (lowest, highest))
+    if name == "body.yaw_inertia":
+        lowest, highest = lowest * smaller, highest * larger
     neutral_too = not (name.startswith("body.") or lowest <= neutral <= highest)
     return Field(name, unit, lowest, highest, exceptions=(neutral,) if neutral_too else ())
 

@@ -118,12 +118,13 @@ def read_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str
     spec = _read_spec(path, content["spec"])
     if "body" not in content and "effects" not in content:
         return spec, in_short(spec, content.get("base", "physical")), content.get("provenance", {})
-    body = _read_parameters(path, "body", Body, content["body"])
+    sizes = spec.mass, spec.wheel_radius
+    body = _read_parameters(path, "body", Body, content["body"], sizes)
     effects: dict[str, Any] = {}
     for name, table in _effect_tables(path, content):
         if name in effects:
             raise ValueError(f"{path}: effect {name!r} is there twice; each acts once. Remove one of them.")
-        effects[name] = _read_parameters(path, name, EFFECTS[name], table)
+        effects[name] = _read_parameters(path, name, EFFECTS[name], table, sizes)
     return spec, VehicleParams(body, tuple(effects.values())), content.get("provenance", {})
 
 
@@ -217,7 +218,7 @@ def _effect_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[
     return found
 
 
-def _read_parameters(path: Path, holder: str, kind: Any, table: dict[str, Any]) -> Any:
+def _read_parameters(path: Path, holder: str, kind: Any, table: dict[str, Any], sizes: tuple[float, float]) -> Any:
     known = parameters_of(kind)
     values = {}
     for name, entry in table.items():
@@ -228,7 +229,7 @@ def _read_parameters(path: Path, holder: str, kind: Any, table: dict[str, Any]) 
         whole = fields.check_table(str(path), fields.VALUE, entry, dotted)
         if whole["unit"] != about.unit:
             raise ValueError(f"{path}: {dotted} is in {whole['unit']!r}; it must be in {about.unit!r}. Convert it.")
-        field = fields.parameter_field(dotted, about.unit, about.low, about.high, about.neutral)
+        field = fields.parameter_field(dotted, about.unit, about.low, about.high, about.neutral, sizes)
         values[name] = fields.check(str(path), field, whole["value"])
     missing = {name for name in set(known) - set(values) if f"{holder}.{name}" not in LATER}
     if missing:
