@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sysid.logs.directions import RESPONSE, UNLIKE, VARIED
+from sysid.logs.directions import ALIKE, RESPONSE, UNLIKE, VARIED, likeness
 from sysid.logs.records import Log, Trial
 from sysid.logs.streams import speeds
 
-ALIKE = 0.7  # correlation of a speed with one that it follows
+STILL = 1e-3  # standard deviation of a speed that hardly changes
 LEAST = {True: 0.1, False: 0.4}  # gain of a yaw rate that follows, of a skid drive, which scrubs, and of others
 
 
@@ -52,7 +52,7 @@ def _speeds_beside(trial: Trial, beside: str, measured_input: bool) -> tuple[np.
 def _alike(own: np.ndarray, reference: np.ndarray) -> bool:
     """Whether speeds (2, G) follow those beside them as they are."""
     varied = [k for k in (0, 1) if reference[k].std() > VARIED]
-    return bool(varied) and all(_likeness(own[k], reference[k]) > ALIKE for k in varied)
+    return bool(varied) and all(likeness(own[k], reference[k], STILL) > ALIKE for k in varied)
 
 
 def _side(own: np.ndarray, reference: np.ndarray, half: float, least: float, commands: bool) -> str:
@@ -66,9 +66,9 @@ def _side(own: np.ndarray, reference: np.ndarray, half: float, least: float, com
         beside = reference[now] - reference[now].mean()
         if beside.std() <= VARIED:
             continue
-        follows = _likeness(turned, beside)
+        follows = likeness(turned, beside, STILL)
         gain = float(turned @ beside / (beside @ beside))
-        if abs(follows) < ALIKE or 1 - abs(follows) > UNLIKE * (1 - _likeness(own[now], beside)) or not (
+        if abs(follows) < ALIKE or 1 - abs(follows) > UNLIKE * (1 - likeness(own[now], beside, STILL)) or not (
                 lowest < abs(gain) < 1 / lowest):
             return ""
         gains.append(gain)
@@ -80,8 +80,3 @@ def _side(own: np.ndarray, reference: np.ndarray, half: float, least: float, com
     if commands and gains[0] > 0 and exchanged_off < turned_off:
         return ""
     return "left" if gains[0] > 0 else "right"
-
-
-def _likeness(one: np.ndarray, other: np.ndarray) -> float:
-    """Correlation of two signals (G,); 0 where one hardly changes."""
-    return float(np.corrcoef(one, other)[0, 1]) if min(one.std(), other.std()) > 1e-3 else 0.0

@@ -25,6 +25,7 @@ from sysid.logs.directions import (
     far_point,
     in_fixed_frame,
     inverted,
+    likeness,
     motion_of,
     pooled,
 )
@@ -74,7 +75,7 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
     if not motions:
         return []
     plain = pooled([direction(one, reach) for one in motions])
-    against = float(np.median([_likeness(one.turn, one.omega) for one in motions]))
+    against = float(np.median([likeness(one.turn, one.omega) for one in motions]))
     if against < -WHOLE and pooled([direction(inverted(one), reach) for one in motions]).explained > max(
             WHOLE, plain.explained):
         return [f"{name}: its pose is that of the fixed frame as the vehicle sees it: parent and child are exchanged. "
@@ -112,14 +113,9 @@ def _is_mirrored(motions: Sequence[Motion], reach: float) -> bool:
 
 def _obeys(trials: Sequence[Trial]) -> bool:
     """Whether the odometry's yaw rate has the sign of the commanded one."""
-    found = [_likeness(one.odometry.omega, one.command.at(one.odometry.t - RESPONSE)[1])
+    found = [likeness(one.odometry.omega, one.command.at(one.odometry.t - RESPONSE)[1])
              for one in trials if one.odometry is not None]
     return bool(np.median(found) > 0)
-
-
-def _likeness(one: np.ndarray, other: np.ndarray) -> float:
-    """Correlation of two signals (T,), 0 where one hardly changes."""
-    return float(np.corrcoef(one, other)[0, 1]) if min(one.std(), other.std()) > MOVING else 0.0
 
 
 def another_clock(name: str, trials: Sequence[Trial], beside: str = "speeds beside it") -> str:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.backward_wheel import ALIKE, backward_wheel
+from sysid.logs.backward_wheel import backward_wheel
 from sysid.logs.contradictions import another_clock, contradictions
-from sysid.logs.directions import UNLIKE
+from sysid.logs.directions import ALIKE, UNLIKE
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import CHECK, Command, Log, Trial
 from sysid.logs.stated_sizes import wrong_sizes

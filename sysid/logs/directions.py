@@ -19,10 +19,16 @@ NONE = 0.02  # m/s, below which a speed is none
 VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
 MOVING = 0.05  # m/s or rad/s of a pose that moves
 WHOLE = 0.8  # share of the motion that a direction, or another clock, must explain
+ALIKE = 0.7  # correlation of a speed with one that it follows
 UNLIKE = 0.3  # of what something does not explain, that may be left with something else
 APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
 SURE = 4.0  # standard errors that an angle or a place must have
 PLAINER = 0.03  # share of the motion that speeds along the vehicle do not explain, where another frame counts
+
+def likeness(one: np.ndarray, other: np.ndarray, still: float = MOVING) -> float:
+    """Correlation of two signals (T,); 0 where one changes by no more than `still` (standard deviation)."""
+    return float(np.corrcoef(one, other)[0, 1]) if min(one.std(), other.std()) > still else 0.0
+
 
 @dataclass(frozen=True)
 class Motion:
