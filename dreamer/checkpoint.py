@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import sys
+import time
 import uuid
 import warnings
 import zlib
@@ -28,6 +29,8 @@ import numpy as np
 from dreamer import parallel
 
 KEEP = 2
+LEAST_S, SHARE = 60.0, 0.05
+"""Time between checkpoints [s] and share of the run's time that they take at most, where no interval is asked for."""
 UNFINISHED = ".unfinished-"
 SCHEMA = 1
 ENTRIES = {"config": dict, "files": dict, "env_steps": int, "wall_s": int | float}
@@ -50,6 +53,31 @@ class Moment(NamedTuple):
     """Time trained so far [s]."""
     pretraining: int = 0
     """Steps and updates made so far where no counted step has been; part of the name."""
+
+
+class Pace:
+    """When the next checkpoint is due; `with pace:` around the writing of each."""
+
+    def __init__(self, every_s: float | None) -> None:
+        """`every_s`: time between two [s]; None goes by what they take."""
+        self._every_s, self._took = every_s, 0.0
+        self._began = self._ended = time.monotonic()
+
+    def __enter__(self) -> None:
+        self._began = time.monotonic()
+
+    def __exit__(self, *error: object) -> None:
+        self._ended = time.monotonic()
+        self._took = self._ended - self._began
+
+    @property
+    def every_s(self) -> float:
+        """Time from the end of the last one to the next [s]."""
+        return max(LEAST_S, self._took * (1 / SHARE - 1)) if self._every_s is None else self._every_s
+
+    def due(self) -> bool:
+        """Whether it is time."""
+        return time.monotonic() - self._ended >= self.every_s
 
 
 def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | None = None) -> Path:

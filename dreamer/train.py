@@ -91,8 +91,9 @@ class TrainingOptions:
     Training goes on meanwhile, and lines are logged in order. Not with several devices."""
     eval_every: int = 10_000
     """Control steps between evaluations; one more happens at the end."""
-    checkpoint_every_s: float = 600.0
-    """Time between checkpoints [s]; one more is written at the end."""
+    checkpoint_every_s: float | None = None
+    """Time between checkpoints [s]; one more is written at the end. None: a minute, or as much more as makes them a
+    twentieth of the run's time."""
     log_every_s: float = 5.0
     """Time between log lines [s]."""
     resume: bool = True
@@ -219,7 +220,8 @@ class _Run:
         options.announce(f"training; its program was ready after {time.monotonic() - self._began:.0f} s")
         self._bar = Progress(self.total_steps, self.env_steps, options.progress and parallel.is_first_process())
         self._meter = Meter()
-        self._saved_at = self._logged_at = time.monotonic()
+        self._logged_at = time.monotonic()
+        self._pace = checkpoint.Pace(options.checkpoint_every_s)
         self._evaluated = self.env_steps // options.eval_every
 
     def _compiled_ahead(self, seed: int | Sequence[int], mesh: Mesh | None) -> Future | None:
@@ -307,15 +309,15 @@ class _Run:
 
     def _save_where_due(self, now: float, finished: bool) -> None:
         limit = self.options.time_limit_s
-        due = now - self._saved_at >= self.options.checkpoint_every_s
+        due = self._pace.due()
         if jax.process_count() > 1:
             due = self._iterations % AGREE_EVERY == 0 and parallel.agree(due)
         self._stopped = self._stopped or (limit is not None and parallel.agree(now - self._began > limit))
         if finished or self._stopped or due:
             # A run that goes on from here has no older lines.
             self._stopped = self._write_waiting(at_once=True) or self._stopped
-            self._save()
-            self._saved_at = time.monotonic()
+            with self._pace:
+                self._save()
 
     def _save(self) -> None:
         save_state(self.out, self.state, self.config, self._wall_s())

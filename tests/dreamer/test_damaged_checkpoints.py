@@ -77,3 +77,20 @@ def test_damaged_lines_of_a_log_are_left_out(data, tmp_path_factory):
     assert all(json.loads(line)["env_steps"] <= 15 for line in path.read_text().splitlines())
     log.write({"env_steps": 30.0})
     assert json.loads(path.read_text().splitlines()[-1]) == {"env_steps": 30.0}
+
+
+@pytest.mark.parametrize("every_s, took_s, expected_s", [
+    (None, 0.5, 60.0), (None, 30.0, 570.0), (5.0, 30.0, 5.0), (0.0, 30.0, 0.0),
+])  # fmt: skip
+def test_checkpoints_that_take_long_are_written_less_often(monkeypatch, every_s, took_s, expected_s):
+    now = [100.0]
+    monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
+    pace = checkpoint.Pace(every_s)
+    now[0] += 1000.0
+    with pace:
+        now[0] += took_s
+    assert pace.every_s == pytest.approx(expected_s)
+    now[0] += 0.9 * expected_s
+    assert pace.due() == (expected_s == 0.0)
+    now[0] += 0.11 * expected_s
+    assert pace.due()

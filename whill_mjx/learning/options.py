@@ -56,8 +56,8 @@ class TrainOptions:
     """Whether the planner that knows the truth drives the final evaluation too."""
     videos: Annotated[int, Range(0, 1000)] = 4
     """Episodes, and failures, of the final evaluation shown as videos."""
-    checkpoint_every_s: Annotated[float, NOT_NEGATIVE] = 60.0
-    """Time between checkpoints [s]."""
+    checkpoint_every_s: Annotated[float | None, NOT_NEGATIVE] = None
+    """Time between checkpoints [s]; none takes a minute, or as much more as makes them a twentieth of the run's time."""
     lr: Annotated[float | None, Range(0, 1, above=True)] = None
     """Learning rate; none takes the preset's."""
     train_ratio: Annotated[float | None, Range(LEAST_TRAIN_RATIO, 1e6), MODEL] = None

@@ -91,7 +91,7 @@ class _Run:
         compiled = early.result()
         self.run = lambda state: compiled(state, total)
         options.announce(f"training; its program was ready after {time.monotonic() - self.began:.0f} s")
-        self.saved_at = time.monotonic()
+        self.pace = checkpoint.Pace(options.checkpoint_every_s)
         self.bar = Progress(self.iterations * self.each, self.env_steps, options.progress)
 
     @property
@@ -126,9 +126,9 @@ class _Run:
                 self.bar.note({name: f"{line[f'eval/{name}']:.3g}" for name in SHOWN if f"eval/{name}" in line})
                 self.logged = self.env_steps // self.options.eval_every
                 stopped = self.options.stop is not None and self.options.stop(line)
-            if self.done == self.last or stopped or time.monotonic() - self.saved_at >= self.options.checkpoint_every_s:
-                self._save()
-                self.saved_at = time.monotonic()
+            if self.done == self.last or stopped or self.pace.due():
+                with self.pace:
+                    self._save()
 
     def interrupted(self) -> None:
         """Keep what is done; an evaluation that is due would be missing from the run that goes on from here."""
