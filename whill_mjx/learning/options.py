@@ -57,7 +57,7 @@ class TrainOptions:
     videos: Annotated[int, Range(0, 1000)] = 4
     """Episodes, and failures, of the final evaluation shown as videos."""
     checkpoint_every_s: Annotated[float | None, NOT_NEGATIVE] = None
-    """Time between checkpoints [s]; none takes a minute, or as much more as makes them a twentieth of the run's time."""
+    """Time between checkpoints [s]; none: a minute, or as much more as makes them a twentieth of the run's time."""
     lr: Annotated[float | None, Range(0, 1, above=True)] = None
     """Learning rate; none takes the preset's."""
     train_ratio: Annotated[float | None, Range(LEAST_TRAIN_RATIO, 1e6), MODEL] = None
