@@ -14,7 +14,7 @@ from sysid.verdict.forms import forms_of
 from sysid.verdict.found import EFFORT, LARGEST, Candidate, PairScan, Search
 from sysid.verdict.pairs import DRAWS, scan_pairs
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
-from sysid.verdict.rounds import POLISH, Asked, candidates_of, class_of, p_of_last, pair_round
+from sysid.verdict.rounds import POLISH, Asked, candidate_of, candidates_of, class_of, p_of_last, pair_round
 from sysid.verdict.scan import best, null_days
 
 
@@ -50,6 +50,7 @@ def settle(asked: Asked, pairs: PairScan | None) -> Search:
     weighed: list[Weighed] = []
     if findings.something(asked.thresholds):
         weighed = _one_by_one(asked, found, findings)
+        weighed = _in_their_place(asked, found, findings, weighed)
         findings = replace(findings, sets=tuple(one.numbers for one in weighed))
         if pairs is not None and not findings.settled(asked.thresholds):
             # A single effect had its chance with every other one as a further effect.
@@ -76,6 +77,35 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
                         and not more_stands_out(asked, able[0])):
             break
         members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
+    return out
+
+
+def _in_their_place(asked: Asked, found: Search, findings: Findings, weighed: Sequence[Weighed]) -> list[Weighed]:
+    """All sets, with those that one effect after the other does not come by, where the best pair so far leaves more
+    than days differ by: its first effect was the best one alone, and may stand in for another. So what is best beside
+    the second one alone is tried, and what is best beside the runner-up of the first round. What the drives do not
+    separate from the first effect shows beside the second one too."""
+    able = [one for one in weighed if findings.able(one.numbers, asked.thresholds)]
+    pairs = [one for one in able if len(one.members) == 2]
+    best = max(pairs, key=lambda one: one.numbers.gain, default=None)
+    if best is None or asked.p_left(best.members[-1].refit.residual) >= asked.thresholds.alpha:
+        return list(weighed)
+    starts = [one.members[0] for one in [one for one in able if len(one.members) == 1][1:2]]
+    last = best.members[-1]
+    [fit] = asked.refitter.fit_all([Start((last.hypothesis,), asked.base.u, last.refit.split[-1])], POLISH)
+    starts = [one for one in starts if one.hypothesis.effect != last.hypothesis.effect]
+    starts.append(candidate_of(asked, asked.hypotheses.index(last.hypothesis), fit, asked.base))
+    out, tried = list(weighed), {frozenset(one.numbers.effects) for one in weighed}
+    for first in starts:
+        candidates = candidates_of(asked, found, first.refit)
+        new = [one for one in candidates if one.p < asked.thresholds.alpha
+               and frozenset((first.hypothesis.effect, one.hypothesis.effect)) not in tried]
+        out += [_weighed(asked, (first, one), (found.rounds[0], candidates)) for one in new[: EFFORT.weighed]]
+    mine = next((one for one in candidates if one.hypothesis.effect == best.numbers.effects[0]), None)
+    if mine is not None:
+        classes = (tuple(class_of(asked, mine, candidates)), *best.numbers.classes[1:])
+        shown = replace(best, numbers=replace(best.numbers, classes=classes))
+        out = [shown if one is best else one for one in out]
     return out
 
 

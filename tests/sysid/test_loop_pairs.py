@@ -12,6 +12,7 @@ from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_power import detectable
+from sysid.verdict import rounds
 from sysid.verdict.found import tail
 from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
 from sysid.verdict.posterior import Thresholds
@@ -91,6 +92,20 @@ def test_what_resembles_two_effects_together_gives_way_to_them(wander):
     found = verdict(evidence, wander)
     assert found.rounds[0][0].hypothesis.effect == "command_scale"
     assert named(found) == ("named", {"slope", "track_width"})
+
+
+def test_what_the_drives_do_not_separate_from_an_effect_shows_beside_the_other_one(wander, monkeypatch):
+    """The first round tries too few effects to see that `track_width` fits nearly as well as slope."""
+    evidence = drives((1.0, 0.0, 0.8, 0.0), close=0.93)
+    evidence = replace(evidence, residual=evidence.residual + np.sin(np.arange(120) / 5))  # something unknown is left
+    evidence = replace(evidence, moments=np.einsum("bni,bn->bi", evidence.design, evidence.residual))
+    asked = replace(begin(evidence, SimpleNamespace(hypotheses=EFFECTS, wander=wander), Linear(evidence),
+                          LoopConfig(draws=300)), similar=np.eye(4))  # their signatures where both are small differ
+    starts = rounds._starts
+    monkeypatch.setattr(rounds, "_starts", lambda *given: starts(*given)[: None if given[3] else 1])
+    found = settle(asked, pairs_of_effects(asked))
+    assert {one.hypothesis.effect for one in found.accepted} == {"slope", "side_force"}
+    assert next(members for members in found.classes if members[0] == "slope") == ["slope", "track_width"]
 
 
 def test_one_class_is_no_pair(wander):
