@@ -10,7 +10,8 @@ The variants of `--tries`, each against the program as it is:
 - scan_gradients: the scan over time is differentiated as it is, so that every step adds to the weights' gradients;
 - unhoisted: besides, the action's and the tokens' share of the products, the masks and the casts are inside the scan;
 - no_command_buffers, command_buffers_while: no CUDA graphs, and graphs that hold whole loops;
-- deterministic, no_autotune: flags of XLA, as the reference learner sets the first and to see what the second is worth;
+- deterministic, no_autotune, no_triton_gemm: flags of XLA; the reference learner sets the first one, the others show what
+  choosing among kernels costs in compilation and brings in speed;
 - fused_posterior: the forward pass of the observing scan as one kernel (`benchmarks.learner_fused`), against that scan.
 """
 
@@ -51,6 +52,7 @@ FLAGS = {
     "command_buffers_while": f"--xla_gpu_enable_command_buffer={WHILE}",
     "deterministic": "--xla_gpu_deterministic_ops=true",
     "no_autotune": "--xla_gpu_autotune_level=0",
+    "no_triton_gemm": "--xla_gpu_enable_triton_gemm=false",
 }
 """Tries that need a process of their own, for XLA reads its flags once."""
 UNROLLS = (1, 2, 4, 8)
@@ -178,8 +180,8 @@ def _timed(one: Variant, program: tuple[Updates, Future[float]] | None, blocks: 
         _report(one.label, error)
         return {}
     rates = [max(one.runs, 1) / s for s in seconds]
-    print(f"{one.label}: compiled in {compile_s:.1f} s", flush=True)
     return {
+        f"compile_s_{one.label}": harness.figure([compile_s], "s"),
         f"updates_per_s_{one.label}": harness.figure(rates, "1/s"),
         f"replayed_steps_per_s_{one.label}": harness.figure(
             [one.config.replayed_per_update * rate for rate in rates], "1/s"

@@ -122,8 +122,8 @@ def test_a_variant_that_fails_is_left_out_and_the_rest_is_measured(monkeypatch, 
     found = {}
     learner_study.run("size12m", preset("size12m"), args, found.update)
     assert {name: one["value"] for name, one in found.items()} == {
-        "updates_per_s_12m_batch4": 2.0, "replayed_steps_per_s_12m_batch4": 2.0 * 4 * 64,
-        "updates_per_s_12m_seeds4": 8.0, "replayed_steps_per_s_12m_seeds4": 8.0 * 16 * 64,
+        "compile_s_12m_batch4": 1.0, "updates_per_s_12m_batch4": 2.0, "replayed_steps_per_s_12m_batch4": 2.0 * 4 * 64,
+        "compile_s_12m_seeds4": 1.0, "updates_per_s_12m_seeds4": 8.0, "replayed_steps_per_s_12m_seeds4": 8.0 * 16 * 64,
     }  # fmt: skip
     said = capsys.readouterr().out
     assert "12m_batch2: failed, ValueError: does not trace" in said
