@@ -10,7 +10,7 @@ The variants of `--tries`, each against the program as it is:
 - scan_gradients: the scan over time is differentiated as it is, so that every step adds to the weights' gradients;
 - unhoisted: besides, the action's and the tokens' share of the products, the masks and the casts are inside the scan;
 - no_command_buffers, command_buffers_while: no CUDA graphs, and graphs that hold whole loops;
-- deterministic, no_autotune, no_triton_gemm: flags of XLA; the reference learner sets the first one, the others show what
+- deterministic, no_autotune, no_triton_gemm: flags of XLA; the reference learner sets the first, the others show what
   choosing among kernels costs in compilation and brings in speed;
 - fused_posterior: the forward pass of the observing scan as one kernel (`benchmarks.learner_fused`), against that scan.
 """
