@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,17 +96,33 @@ def _in_their_place(asked: Asked, found: Search, findings: Findings, weighed: Se
     starts = [one for one in starts if one.hypothesis.effect != last.hypothesis.effect]
     starts.append(candidate_of(asked, asked.hypotheses.index(last.hypothesis), fit, asked.base))
     out, tried = list(weighed), {frozenset(one.numbers.effects) for one in weighed}
+    beside = {}
     for first in starts:
-        candidates = candidates_of(asked, found, first.refit)
+        beside[first.hypothesis.effect] = candidates = candidates_of(asked, found, first.refit)
         new = [one for one in candidates if one.p < asked.thresholds.alpha
                and frozenset((first.hypothesis.effect, one.hypothesis.effect)) not in tried]
         out += [_weighed(asked, (first, one), (found.rounds[0], candidates)) for one in new[: EFFORT.weighed]]
-    mine = next((one for one in candidates if one.hypothesis.effect == best.numbers.effects[0]), None)
-    if mine is not None:
-        classes = (tuple(class_of(asked, mine, candidates)), *best.numbers.classes[1:])
-        shown = replace(best, numbers=replace(best.numbers, classes=classes))
-        out = [shown if one is best else one for one in out]
-    return out
+    alone = {one.hypothesis.effect: one.gain for one in (*found.rounds[0], *starts)}
+    return [_with_classes(asked, one, out, alone, beside) if len(one.members) == 2 else one for one in out]
+
+
+def _with_classes(asked: Asked, pair: Weighed, sets: Sequence[Weighed], alone: Mapping[str, float],
+                  beside: Mapping[str, Sequence[Candidate]]) -> Weighed:
+    """A pair whose classes hold what may stand in the place of either effect, by all that was refitted beside the other
+    one: in `sets`, and as candidates of a round. `alone` are the gains of single effects."""
+    classes = list(pair.numbers.classes)
+    for place, name in enumerate(pair.numbers.effects):
+        other = pair.numbers.effects[1 - place]
+        if other not in alone:
+            continue
+        there = [replace(next(each for each in one.members if each.hypothesis.effect != other),
+                         gain=one.numbers.gain - alone[other])
+                 for one in sets if len(one.members) == 2 and other in one.numbers.effects]
+        there += beside.get(other, ())
+        mine = max((one for one in there if one.hypothesis.effect == name), key=lambda one: one.gain)
+        found = class_of(asked, mine, there)
+        classes[place] = (*found, *(one for one in classes[place] if one not in found))
+    return replace(pair, numbers=replace(pair.numbers, classes=tuple(map(tuple, classes))))
 
 
 def more_stands_out(asked: Asked, one: Weighed) -> bool:
