@@ -16,6 +16,7 @@ the best one stays in the fit without a name, and what still stands out beside i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
@@ -44,6 +45,7 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
         wheels: whether any trial has an odometry.
     """
     thresholds = asked.thresholds
+    asked = asked if wheels else replace(asked, named=_shown_by_pose)
     found = Search("none", asked.base, asked.base, asked.scan)
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
@@ -61,7 +63,7 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
         as_good = [one for one, gains in standing if one is best or interval_of_sum(most - gains)[0] <= 0]
         alike = class_of(asked, best, candidates)
         shown = as_good if wheels else [
-            one for one in candidates if card_of(one.hypothesis.effect).shown_by_pose
+            one for one in candidates if _shown_by_pose(one.hypothesis.effect)
             and (any(one is good for good in as_good)
                  or one.hypothesis.effect in alike and interval_of_sum(held_back(asked, one.refit))[0] > 0)]
         if not shown:
@@ -84,6 +86,11 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
     if unseen or found.p_value < SURE:
         found.verdict = "unexplained"
     return _said(asked, found, lacking or against)
+
+
+def _shown_by_pose(effect: str) -> bool:
+    """Whether an outside pose shows an effect without odometry."""
+    return card_of(effect).shown_by_pose
 
 
 def _said(asked: Asked, found: Search, reason: str) -> Search:

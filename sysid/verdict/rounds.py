@@ -57,6 +57,8 @@ class Asked:
     """Says what was just done."""
     far: Looked | None = None
     """A scan around the reference: a large effect shows best there."""
+    named: Callable[[str], bool] = lambda _: True
+    """Whether these drives could show an effect to be what it is. Others are looked for beside, not in their place."""
 
     @cached_property
     def count(self) -> float:
@@ -111,7 +113,9 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
     so is what might imitate the best; in order of gain."""
     refitter, hypotheses = asked.refitter, asked.hypotheses
     taken = {one.effect for one in current.hypotheses}
-    chosen = _starts(hypotheses, scans, asked.scan, taken, asked.thresholds)
+    left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
+    kinds = [[h for h in left if asked.named(hypotheses[h].effect) == able] for able in (True, False)]
+    chosen = [one for each in kinds for one in _starts(hypotheses, scans, asked.scan, each, asked.thresholds)]
     at = Start.at(current)
 
     def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
@@ -119,8 +123,7 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
 
     fits = refitter.fit_all(nearer(refitter, starts(chosen), current), FIRST_LOOK)
     asked.report(f"refits, round {number}")
-    least = current.cost - asked.thresholds.form * max((current.cost - fit.cost for fit in fits), default=0.0)
-    best_of = [i for i, fit in enumerate(fits) if fit.cost < min(least, current.cost)]
+    best_of = _nearly_best(asked, fits, current)
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], TO_ITS_END), strict=True):
         fits[i] = fit
     for i in (i for i in best_of if len(fits[i].hypotheses[-1].axes) > 1 and refitter.stuck(fits[i])):
@@ -136,6 +139,13 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
     asked.report(f"rivals, round {number}")
     candidates = [candidate_of(asked, h, fit, current) for (h, _), fit in zip(chosen, fits, strict=True)]
     return sorted(candidates, key=lambda one: -one.gain)
+
+
+def _nearly_best(asked: Asked, fits: Sequence[Refit], current: Refit) -> list[int]:
+    """Which fits gain enough beside the best one of their kind to be followed to their end."""
+    gains, able = [current.cost - fit.cost for fit in fits], [asked.named(fit.hypotheses[-1].effect) for fit in fits]
+    most = [max(gain for gain, kind in zip(gains, able, strict=True) if kind == mine) for mine in able]
+    return [i for i, gain in enumerate(gains) if gain > max(asked.thresholds.form * most[i], 0.0)]
 
 
 def nearer(refitter: Refitter, starts: Sequence[Start], current: Refit) -> list[Start]:
@@ -158,15 +168,14 @@ def rescan(asked: Asked, current: Refit) -> Looked:
 
 
 def _starts(
-    hypotheses: Sequence[Hypothesis], scans: Sequence[Looked], first: Scan, taken: set[str], thresholds: Thresholds
+    hypotheses: Sequence[Hypothesis], scans: Sequence[Looked], first: Scan, left: Sequence[int], thresholds: Thresholds
 ) -> list[tuple[int, np.ndarray]]:
-    """Hypotheses to refit and where to start.
+    """Hypotheses out of `left` to refit and where to start.
 
     Of each scan those that gain most of what stands out, what gains most whether it does or not, and of the last the
     one that stands out most. A large effect shows best in the scan around the reference, a small one in that around the
     base refitted to these drives. What wanders from day to day stands out less than what imitates it.
     """
-    left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
     order: dict[str, tuple[int, np.ndarray]] = {}
     for number, (gain, worth, q) in enumerate(scans):
         standing = [h for h in left if worth[h] > 0 and first.p_of(h, float(worth[h])) < thresholds.alpha]

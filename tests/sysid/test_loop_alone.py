@@ -19,13 +19,13 @@ from sysid.missing.joint_fit import Start as JointStart
 from sysid.missing.signatures import group_names, manoeuvre_groups
 from sysid.replay.one_drive import Commanded, path_of
 from sysid.replay.rollout import make_batch
-from sysid.verdict import alone
+from sysid.verdict import alone, rounds
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
 from sysid.verdict.found import Candidate, Effort
 from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
 from sysid.verdict.result import LoopConfig
-from sysid.verdict.rounds import Asked, begin, nearer
+from sysid.verdict.rounds import Asked, _nearly_best, begin, nearer, refitted
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 
@@ -233,6 +233,23 @@ def weighed(monkeypatch, gains, class_of, wheels=True):
     monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(told[fit.cost]))
     monkeypatch.setattr(alone, "class_of", class_of)
     return search_alone(asked, wheels=wheels)
+
+
+def test_what_may_have_a_name_is_tried_and_followed_to_its_end_beside_what_gains_more(monkeypatch):
+    evidence = drives((0.0, 0.0, 1.0, 0.4))
+    asked = asked_of(evidence, Linear(evidence))
+    monkeypatch.setattr(rounds, "EFFORT", Effort(candidates=1))
+
+    def tried(asked):
+        scan = (asked.scan.gain, asked.scan.worth, asked.scan.q)
+        return {one.hypothesis.effect: one for one in refitted(asked, asked.base, [scan])}
+
+    apart = replace(asked, named=lambda effect: effect != "side_force")
+    assert "command_scale" not in tried(asked)
+    found = tried(apart)
+    assert found["side_force"].gain > 2 * found["command_scale"].gain > 0
+    fits = [found[name].refit for name in ("side_force", "command_scale")]
+    assert _nearly_best(asked, fits, asked.base) == [0] and _nearly_best(apart, fits, asked.base) == [0, 1]
 
 
 def test_with_nothing_found_it_says_that_it_cannot_tell():

@@ -119,10 +119,9 @@ def test_what_gains_most_is_refitted_though_it_does_not_stand_out():
     effects = [effect(name) for name in ("traction", "payload", "slope")]
     gain, worth = np.array([100.0, 20.0, 1.0]), np.array([1.0, 15.0, 1.0])
     first = SimpleNamespace(p_of=lambda h, worth: 0.001 if worth > 10 else 0.5)
-    chosen = _starts(effects, [(gain, worth, tuple(np.ones(1) for _ in effects))] * 2, first, set(), Thresholds())
+    chosen = _starts(effects, [(gain, worth, tuple(np.ones(1) for _ in effects))] * 2, first, range(3), Thresholds())
     assert sorted(h for h, _ in chosen) == [0, 1]
-    chosen = _starts(effects, [(gain, worth, tuple(np.ones(1) for _ in effects))] * 2, first, {"traction"},
-                     Thresholds())
+    chosen = _starts(effects, [(gain, worth, tuple(np.ones(1) for _ in effects))] * 2, first, [1, 2], Thresholds())
     assert [h for h, _ in chosen] == [1]
 
 
