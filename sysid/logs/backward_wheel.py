@@ -4,8 +4,6 @@ v and omega give the speeds of the two rims, v -+ omega track / 2. Negating the 
 and 2 v / track; negating the right one turns them into the negatives of these.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sysid.logs.directions import ALIKE, RESPONSE, UNLIKE, VARIED, likeness

@@ -1,7 +1,5 @@
 """Which data a log was read from."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Motion in the plane: the heading of a quaternion, the speeds of a pose, and the pose that speeds add up to."""
 
-from __future__ import annotations
-
 import numpy as np
 
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds

@@ -4,8 +4,6 @@ A dataset's commands repeat exactly. A bag's never do: it begins at another mome
 never.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Nominal sizes that a log contradicts: the outside pose goes or turns further than the odometry, which uses them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

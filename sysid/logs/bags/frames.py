@@ -1,7 +1,5 @@
 """Streams out of the transforms between frames, where no topic has a pose or the caller names them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path

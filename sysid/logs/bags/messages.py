@@ -1,7 +1,5 @@
 """The numbers of one message."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

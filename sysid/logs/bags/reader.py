@@ -6,8 +6,6 @@ PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and
 no pose, the transforms between frames (TFMessage) are chained to one.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """One recording: where it is, its streams, and the topics and types that hold them."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from pathlib import Path

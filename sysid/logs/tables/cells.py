@@ -1,7 +1,5 @@
 """Numbers in the cells of a text file: decimal commas, separators of thousands, dates and times of day."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime

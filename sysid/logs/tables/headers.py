@@ -1,7 +1,5 @@
 """Names of the columns of a text file: above it, in comments, in several lines, or nowhere."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """A text file as a table of numbers."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path
