@@ -4,8 +4,6 @@ It is the time from the last command to half of the speed, less that from a comm
 the vehicle responds equally late to both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -90,11 +88,6 @@ def with_own_timeout(log: Log) -> Log:
             f"command, as {found.stops} pauses of the commands show: replays stop there too")
     return replace(log, trials=trials, notes=(*log.notes, note),
                    fields={**log.fields, "found_timeout": [found.value, found.low, found.high]})
-
-
-def timeout_stops(trial: Trial) -> list[Stop]:
-    """Pauses of the commands in which the vehicle stops though the last one was to move."""
-    return _pauses(trial)[0]
 
 
 def _pauses(trial: Trial) -> tuple[list[Stop], list[float]]:
@@ -186,9 +179,7 @@ def _rates(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     return next((one for name in ("odometry", "ground_truth") if (one := speeds(trial, name)) is not None), None)
 
 
-def _asked(
-    trial: Trial, k: int, rates: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, float]:
+def _asked(trial: Trial, k: int, rates: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, float]:
     """The speed that command k asks most of, and how many times what shows."""
     sizes = [value / least for value, least in zip((trial.command.v[k], trial.command.omega[k]), ASKED, strict=True)]
     most = int(np.argmax(np.abs(sizes)))
@@ -198,9 +189,7 @@ def _asked(
 def _crossing(t: np.ndarray, share: np.ndarray, level: float = HALF) -> float:
     """Time at which a falling signal (T,) first passes a level [s]."""
     below = np.flatnonzero(share < level)
-    if not len(below):
-        return float(t[-1])
-    k = int(below[0])
-    if k == 0:
-        return float(t[0])
+    k = int(below[0]) if len(below) else len(t) - 1
+    if k == 0 or not len(below):
+        return float(t[k])
     return float(np.interp(level, [share[k], share[k - 1]], [t[k], t[k - 1]]))

@@ -4,10 +4,7 @@ and poses that no vehicle drives: jumps from row to row, rows that stand still, 
 Clocks are compared by rates of turning and of motion, since no frame changes them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +26,8 @@ from sysid.logs.directions import (
     motion_of,
     pooled,
 )
-from sysid.logs.records import Trial
+from sysid.logs.planar import differenced, half_span
+from sysid.logs.records import Trial, logged_pose
 from sysid.logs.streams import SMOOTHING, speeds
 
 LITTLE = 0.75  # share of the motion that a direction must explain, below which something is wrong
@@ -43,6 +41,12 @@ LEFT = {"odometry": 0.5, "commands": UNLIKE}
 """Of what is not alike, what a clock that runs fast may leave, beside what is measured and beside commands."""
 DRIFT = 0.3  # s by which clocks must come apart in a drive to differ from a delay
 MOST, FAST, RATE_STEP = 0.15, 0.2, 0.005  # by which a clock may run fast or slow, how far is searched, and its steps
+JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step that is a jump
+RARE = (3, 0.05)  # jumps of one drive, and of the rows of an outside pose; more are noise
+HELD = 0.5  # s for which rows repeat before a jump when a driver was held up
+FROZEN = 1.0  # s for which rows repeat that is longer than a driver takes between two updates
+STILL = 1e-3  # m/s and rad/s below which a speed is none
+MOVED = 0.5  # m and rad that a vehicle goes and turns by when each of its columns must change
 
 
 def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, list[str]]:
@@ -158,15 +162,13 @@ def lateness(trial: Trial, name: str, beside: bool = False) -> float | None:
 
     Rates of turning and motion are compared: no frame changes them. `beside`: with the commands in any case.
     """
-    source, odometry = getattr(trial, name), trial.odometry
-    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
+    pose, odometry = logged_pose(getattr(trial, name), 20), trial.odometry
+    if pose is None:
         return None
-    begin, end = min(source.t[0], trial.command.t[0]), max(source.t[-1], trial.command.t[-1])
-    t = np.arange(begin, end, LAG_DT)
-    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
-    inside = (t > source.t[0] + half) & (t < source.t[-1] - half)
-    x, y, yaw = ((np.interp(t + half, source.t, one) - np.interp(t - half, source.t, one)) / (2 * half) * inside
-                 for one in (source.x, source.y, source.yaw))
+    half = half_span(pose.t)
+    t = np.arange(min(pose.t[0], trial.command.t[0]), max(pose.t[-1], trial.command.t[-1]), LAG_DT)
+    inside = (t > pose.t[0] + half) & (t < pose.t[-1] - half)
+    x, y, yaw = (differenced(pose.t, one, t, half) * inside for one in pose.values.T)
     v, omega = trial.command.at(t - RESPONSE, (0.0, 0.0))
     commanded = beside or odometry is None or bool(max(odometry.v.std(), odometry.omega.std()) <= NONE)
     if odometry is not None and not commanded:
@@ -207,11 +209,11 @@ def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.n
 
 def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [s], speed and yaw rate that a vehicle has which follows its commands with a usual lag."""
+    from scipy.signal import lfilter
+
     t = np.arange(trial.command.t[0], max(trial.duration, trial.command.t[-1]), LAG_DT / 2)
-    v, omega = trial.command.at(t)
-    share = 1 - np.exp(-LAG_DT / 2 / RESPONSE)
-    for k in range(1, len(t)):
-        v[k], omega[k] = v[k - 1] + share * (v[k] - v[k - 1]), omega[k - 1] + share * (omega[k] - omega[k - 1])
+    kept = np.exp(-LAG_DT / 2 / RESPONSE)
+    v, omega = (lfilter([1 - kept], [1.0, -kept], one, zi=[kept * one[0]])[0] for one in trial.command.at(t))
     return t, v, omega
 
 
@@ -225,8 +227,6 @@ def _likeness_by_lag(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
     """Odometry whose pose moves, or turns, while the speed of it is exactly zero."""
     found = [shares for trial in trials if (shares := _empty_shares(trial)) is not None]
-    if not found:
-        return []
     usual = [float(np.median(known)) if (known := [one[k] for one in found if np.isfinite(one[k])]) else 0.0
              for k in (0, 1)]
     empty = [name for name, share in zip(("v", "omega"), usual, strict=True) if share > EMPTY]
@@ -239,33 +239,20 @@ def _empty_speeds(trials: Sequence[Trial]) -> list[str]:
 
 def _empty_shares(trial: Trial) -> tuple[float, float] | None:
     """Shares of the time in which the pose travels and v is exactly zero, or it turns and omega is; or nan."""
-    stream = trial.odometry
-    if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < 20:
+    stream, pose = trial.odometry, logged_pose(trial.odometry, 20)
+    if stream is None or pose is None:
         return None
-    half = max(SMOOTHING, float(np.median(np.diff(stream.t))))
-    x, y, turn = (np.abs(np.interp(stream.t + half, stream.t, one) - np.interp(stream.t - half, stream.t, one))
-                  / (2 * half) for one in (stream.x, stream.y, stream.yaw))
-    shares = []
-    for rate, speed in ((np.hypot(x, y), stream.v), (turn, stream.omega)):
-        faster = rate > max(MOVING, FASTER * float(np.percentile(rate, 95)))
-        shares.append(float(_silent(stream.t, speed, half)[faster].mean()) if faster.sum() > 10 else float("nan"))
-    return shares[0], shares[1]
-
-
-def _silent(t: np.ndarray, speed: np.ndarray, half: float) -> np.ndarray:
-    """Rows (T,) around which a speed is exactly zero for as long as the pose is looked at, and a row more."""
-    moved = np.concatenate([[0], np.cumsum(speed != 0)])
-    first = np.maximum(np.searchsorted(t, t - half) - 1, 0)
+    t, half = pose.t, max(SMOOTHING, float(np.median(np.diff(pose.t))))
+    x, y, turn = (differenced(t, one, t, half) for one in pose.values.T)
+    first = np.maximum(np.searchsorted(t, t - half) - 1, 0)  # for as long as the pose is looked at, and a row more
     last = np.minimum(np.searchsorted(t, t + half, side="right") + 1, len(t))
-    return np.asarray(moved[last] == moved[first])
-
-
-JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step that is a jump
-RARE = (3, 0.05)  # jumps of one drive, and of the rows of an outside pose; more are noise
-HELD = 0.5  # s for which rows repeat before a jump when a driver was held up
-FROZEN = 1.0  # s for which rows repeat that is longer than a driver takes between two updates
-STILL = 1e-3  # m/s and rad/s below which a speed is none
-MOVED = 0.5  # m and rad that a vehicle goes and turns by when each of its columns must change
+    shares = []
+    for rate, speed in ((np.hypot(x, y), stream.v), (np.abs(turn), stream.omega)):
+        faster = rate > max(MOVING, FASTER * float(np.percentile(rate, 95)))
+        moved = np.append(0, np.cumsum(speed != 0))
+        silent = (moved[last] == moved[first])[faster]
+        shares.append(float(silent.mean()) if faster.sum() > 10 else float("nan"))
+    return shares[0], shares[1]
 
 
 def jumps(name: str, trials: Sequence[Trial]) -> list[str]:
@@ -275,45 +262,37 @@ def jumps(name: str, trials: Sequence[Trial]) -> list[str]:
         return []
     trial, at = found[0]
     stream, first = getattr(trial, name), int(at[0])
-    sizes = [(abs(float(np.hypot(*(np.diff(one)[first] for one in (stream.x, stream.y))))), "m")]
-    sizes += [] if stream.yaw is None else [(abs(float(np.diff(stream.yaw)[first])), "rad")]
-    size = " and ".join(f"{step:.2f} {unit}" for step, unit in sizes if step > JUMP[0])
+    x, y, turn = np.abs([np.diff(one)[first] for one in (stream.x, stream.y, stream.yaw)])
+    size = " and ".join(f"{step:.2f} {unit}" for step, unit in ((np.hypot(x, y), "m"), (turn, "rad")) if step > JUMP[0])
     said = (f"{name}: in {len(found)} of {len(trials)} trials ({trial.name}, at {stream.t[first + 1]:.1f} s) its pose "
             f"jumps by {size} from one row to the next, ")
     if name == "ground_truth":
         return [f"{said}faster than it moves elsewhere: tracking was lost, or took another body for the vehicle. Leave "
                 "those rows out, or split the trial there."]
-    if (held := _held_before(stream, first)) > HELD:
+    rows = np.stack([stream.x, stream.y], axis=-1)[: first + 1]
+    other = np.flatnonzero((rows != rows[-1]).any(axis=1))
+    if (held := float(stream.t[first] - stream.t[other[-1] + 1 if len(other) else 0])) > HELD:
         return [f"{said}after rows that repeat for {held:.1f} s: its driver was held up. Split the trial there."]
     return [f"{said}which its speeds do not: it was reset there. Split the trial there."]
 
 
 def _jumps_of(name: str, trial: Trial) -> np.ndarray:
     """Rows before the jumps (J,) of a stream of a trial; none where there are so many that they are noise."""
-    stream, odometry, none = getattr(trial, name), trial.odometry, np.zeros(0, int)
-    if stream is None or stream.x is None or stream.y is None or len(stream.t) < 20:
-        return none
-    dt = np.diff(stream.t)
-    steps = [np.hypot(np.diff(stream.x), np.diff(stream.y))]
-    steps += [] if stream.yaw is None else [np.abs(np.diff(stream.yaw))]
+    pose, odometry = logged_pose(getattr(trial, name), 20), trial.odometry
+    if pose is None:
+        return np.zeros(0, int)
+    dt = np.diff(pose.t)
     found = np.zeros(len(dt), bool)
-    for step, speed in zip(steps, ("v", "omega"), strict=False):
+    for step, speed in ((np.hypot(np.diff(pose.x), np.diff(pose.y)), "v"), (np.abs(np.diff(pose.yaw)), "omega")):
         usual = float(np.percentile(step / dt, 95)) * dt
         if odometry is not None:
-            rate = np.abs(np.interp(stream.t, odometry.t, getattr(odometry, speed)))
+            rate = np.abs(np.interp(pose.t, odometry.t, getattr(odometry, speed)))
             way = np.maximum(rate[1:], rate[:-1]) * dt
             usual = np.maximum(usual, np.max([np.roll(way, shift) for shift in (-2, -1, 0, 1, 2)], axis=0))
         found |= step > JUMP[0] + JUMP[1] * usual  # rows held up catch up at once
     most = RARE[0] if name == "odometry" else max(RARE[0], RARE[1] * len(dt))
     at = np.flatnonzero(found)
-    return at if len(at) <= most else none
-
-
-def _held_before(stream: Any, row: int) -> float:
-    """For how long rows repeat up to one [s]."""
-    rows = np.stack([stream.x, stream.y], axis=-1)[: row + 1]
-    other = np.flatnonzero((rows != rows[-1]).any(axis=1))
-    return float(stream.t[row] - stream.t[other[-1] + 1 if len(other) else 0])
+    return at if len(at) <= most else at[:0]
 
 
 def frozen(name: str, trials: Sequence[Trial]) -> list[str]:
@@ -329,16 +308,13 @@ def frozen(name: str, trials: Sequence[Trial]) -> list[str]:
 
 def _frozen_of(name: str, trial: Trial) -> tuple[float, float, str, float] | None:
     """Begin and end [s] of the longest time in which a pose repeats, what moves on meanwhile, and how far."""
-    stream = getattr(trial, name)
     other = "odometry" if name == "ground_truth" else "ground_truth"
-    beside = getattr(trial, other)
-    if stream is None or beside is None or beside.x is None:
+    stream, beside, odometry = logged_pose(getattr(trial, name)), logged_pose(getattr(trial, other)), trial.odometry
+    if stream is None or beside is None:
         return None
-    if stream.x is None or stream.y is None or stream.yaw is None:
-        return None
-    same = (np.diff(stream.x) == 0) & (np.diff(stream.y) == 0) & (np.diff(stream.yaw) == 0)
-    if name == "odometry":  # at rest it repeats as well
-        same &= (np.abs(stream.v[:-1]) > STILL) | (np.abs(stream.omega[:-1]) > STILL)
+    same = (np.diff(stream.values, axis=0) == 0).all(axis=1)
+    if name == "odometry" and odometry is not None:  # at rest it repeats as well
+        same &= (np.abs(odometry.v[:-1]) > STILL) | (np.abs(odometry.omega[:-1]) > STILL)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     runs = [(float(stream.t[a]), float(stream.t[b])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     begin, end = max(runs, key=lambda one: one[1] - one[0], default=(0.0, 0.0))

@@ -1,7 +1,5 @@
 """Recordings to driving-log datasets: the drives of bags, tables and measured sets, written as trials."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Container, Sequence
 from dataclasses import replace
@@ -13,14 +11,13 @@ import numpy as np
 from sysid.logs import lerobot
 from sysid.logs.bags.clocks import clock_notes, in_order, stream_times
 from sysid.logs.bags.reader import read_bag
-from sysid.logs.bags.recording import PACKED, Bag, find_bags
-from sysid.logs.conversion_options import ConvertConfig
+from sysid.logs.bags.recording import OPTIONS, PACKED, find_bags
 from sysid.logs.coverage import sanity
 from sysid.logs.dataset_writing import HEADERS, Found, write_dataset
-from sysid.logs.drive_cuts import SHORTEST, Drive, Source, at_axle, cut_drives, trial_drive
+from sysid.logs.drive_cuts import SHORTEST, ConvertConfig, Drive, Source, at_axle, cut_drives, trial_drive
 from sysid.logs.log import load_log, read_csv, read_fields, spec_from_fields
 from sysid.logs.measured import detect_format, is_known, load_whole
-from sysid.logs.records import Log
+from sysid.logs.records import Log, spaced
 from sysid.logs.sources import is_lerobot
 from sysid.logs.tables.drives import TextDrive, join_drives, read_drives
 from sysid.logs.tables.text_table import text_files
@@ -120,21 +117,13 @@ def _of_known(config: ConvertConfig) -> Found:
 
 
 def _written(folder: Path) -> Drive:
-    """A trial of a dataset as it was written: what its loader makes of a time-out, wheel speeds or a gyro is not in
-    it."""
+    """A trial of a dataset as it was written, without what its loader makes of a time-out, wheel speeds or a gyro."""
     tables: dict[str, Any] = {"odometry": None, "ground_truth": None}
     for stream, header in HEADERS.items():
         if (path := folder / f"{stream}.csv").exists():
             columns = read_csv(path, tuple(header.split(",")))
             tables[stream] = np.column_stack([columns[name] for name in header.split(",")])
     return Drive(folder.name, **tables)
-
-
-def _tables_beside(source: Path) -> list[str]:
-    """A note on tables in a folder of bags, which are not read."""
-    loose = [one for drive in text_files(source) for one in drive if one.suffix.lower() != ".txt"]
-    return [f"left out: {counted(len(loose), 'table')} beside the bags ({loose[0]}). Convert tables by themselves"
-            ] if loose else []
 
 
 def _of_bags(bags: Sequence[Path], config: ConvertConfig, there: VehicleSpec | None) -> Found:
@@ -146,42 +135,36 @@ def _of_bags(bags: Sequence[Path], config: ConvertConfig, there: VehicleSpec | N
         wheels, notes = bool(drives), said if drives else notes
     if not drives and refused:
         raise refused[0]
-    return Found(spec, drives, [*notes, *_tables_beside(config.source)], more={"input": "wheels"} if wheels else {},
-                 stated=_stated(config))
+    if loose := [one for drive in text_files(config.source) for one in drive if one.suffix.lower() != ".txt"]:
+        notes.append(f"left out: {counted(len(loose), 'table')} beside the bags ({loose[0]}). Convert tables by "
+                     "themselves")
+    return Found(spec, drives, notes, more={"input": "wheels"} if wheels else {}, stated=_stated(config))
 
 
 def _bags_drives(
     bags: Sequence[Path], config: ConvertConfig, spec: VehicleSpec, wheels: bool
 ) -> tuple[list[Drive], list[str], list[ValueError]]:
     """Trials of several bags, notes, and why some are left out."""
-    drives: list[Drive] = []
-    notes: list[str] = []
-    refused: list[ValueError] = []
+    drives, notes, refused = list[Drive](), list[str](), list[ValueError]()
     for path in bags:
         try:
             cut_out, said = bag_drives(path, config, spec, wheels)
+            drives += cut_out
+            notes += [f"{path.name}: {note}" for note in said]
         except ValueError as error:
             refused.append(error)
             notes.append(f"left out: {error}")
-            continue
-        drives += cut_out
-        notes += [f"{path.name}: {note}" for note in said]
     return drives, notes, refused
 
 
 def _of_tables(config: ConvertConfig, there: VehicleSpec | None) -> Found:
     """What tables or a LeRobotDataset hold."""
-    said, wheels = config.columns, config.input == "wheels"
-    if not is_lerobot(config.source):
-        spec = _spec(config, there)
-        found, left = read_drives(config.source, said, (spec.wheel_radius, spec.track), wheels)
-        drives, notes, fields = _text_drives(found, config)
-        return Found(spec, drives, [*left, *notes], more=fields, stated=_stated(config))
-    episodes = lerobot.read(config.source)
+    episodes = lerobot.read(config.source) if is_lerobot(config.source) else lerobot.Episodes()
     noted = episodes.spec if config.vehicle == ConvertConfig.vehicle else None
     spec = _spec(config, there, noted)
-    found, left = join_drives(config.source, [(name, [table]) for name, table in episodes.drives], said,
-                              (spec.wheel_radius, spec.track), wheels)
+    how = config.columns, (spec.wheel_radius, spec.track), config.input == "wheels"
+    groups = [(name, [table]) for name, table in episodes.drives]
+    found, left = join_drives(config.source, groups, *how) if groups else read_drives(config.source, *how)
     drives, notes, fields = _text_drives(found, config)
     return Found(spec, drives, [*episodes.notes, *left, *notes], episodes.held_out, fields,
                  _stated(config) if noted is None else None)
@@ -191,41 +174,39 @@ def _text_drives(
     found: Sequence[TextDrive], config: ConvertConfig
 ) -> tuple[list[Drive], list[str], dict[str, Any]]:
     """Trials of drives out of columns, notes, and what dataset.toml says of them."""
-    drives: list[Drive] = []
-    notes: list[str] = []
+    drives, notes = list[Drive](), list[str]()
     inputs = {one.measured_input for one in found}
     if len(inputs) > 1:
         raise ValueError(f"{config.source}: {found[0].name} and others differ in whether they have commands. Convert "
                          "those without into a dataset of their own.")
-    decided = list(dict.fromkeys(str(column) for one in found for column in one.columns))
     for one in found:
         source = Source(config.source, {column.role.partition(".")[0]: column.file for column in one.columns})
         cut_out, said = cut_drives(re.sub(r"[^\w.-]+", "_", one.name), one.tables, source, config)
         drives += cut_out
         notes += [f"{one.name}: {note}" for note in (*one.notes, *said)]
     notes += [f"column {one}{f' ({one.why})' if one.why else ''}" for one in found[0].columns]
-    more: dict[str, Any] = {"columns": decided}
-    if inputs == {True}:
-        more["input"] = "wheels"
-    return drives, notes, more
+    decided = list(dict.fromkeys(str(column) for one in found for column in one.columns))
+    return drives, notes, {"columns": decided, **({"input": "wheels"} if inputs == {True} else {})}
 
 
 def bag_drives(
     path: Path, config: ConvertConfig, spec: VehicleSpec, wheels: bool = False
 ) -> tuple[list[Drive], list[str]]:
     """Trials of one bag, and notes; `spec` has the geometry of wheels whose angles or rates were recorded."""
-    asked = {"command": config.command_topic, "odometry": config.odometry_topic, "ground_truth": config.truth_topic,
-             "imu": config.imu_topic}
-    topics = {name: topic for name, topic in asked.items() if topic is not None}
+    topics = {name: topic for name, option in OPTIONS.items()
+              if (topic := getattr(config, option[2:].replace("-", "_"))) is not None}
     bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
     imu = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name == "imu"})
     bag = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name != "imu"})
     said = clock_notes(bag, config.stamp)
     times = stream_times(bag, config.stamp)
     try:
-        more = stream_times(imu, config.stamp), clock_notes(imu, config.stamp)
-        _check_rates(imu)
-        times, said, bag = {**times, **more[0]}, [*said, *more[1]], replace(bag, streams={**bag.streams, **imu.streams})
+        times_of_imu, said_of_imu = stream_times(imu, config.stamp), clock_notes(imu, config.stamp)
+        for stream in imu.streams.values():
+            if (most := float(np.abs(stream.values).max())) > (field := COLUMNS["gyro"]).high:
+                raise ValueError(f"{path}: topic {stream.topic} turns at up to {most:.3g} rad/s; it must be below "
+                                 f"{field.high:g}. {field.remedy}")
+        times, said, bag = times | times_of_imu, said + said_of_imu, replace(bag, streams=bag.streams | imu.streams)
     except ValueError as error:  # nothing else depends on it
         if config.imu_topic is not None:
             raise
@@ -236,23 +217,14 @@ def bag_drives(
         notes.append("commands have no header: their time is that of receipt, the other streams' that of their header")
     tables = {}
     for name, t in times.items():
-        keep, dropped = _increasing(t)
-        if dropped:
+        keep = spaced(t, 1e-6)
+        if dropped := len(t) - len(keep):
             notes.append(f"{name}: {dropped} messages out of order or with an equal stamp are left out")
         tables[name] = np.column_stack([t[keep], bag.streams[name].values[keep]])
     stem = re.sub(r"[^\w.-]+", "_", _recording_name(path))
     source = Source(path, {name: stream.topic for name, stream in bag.streams.items()})
     drives, said = cut_drives(stem, tables, source, config)
     return drives, [*notes, *said]
-
-
-def _check_rates(bag: Bag) -> None:
-    """Raise ValueError where a gyro turns faster than any vehicle."""
-    for stream in bag.streams.values():
-        most, field = float(np.abs(stream.values).max()), COLUMNS["gyro"]
-        if most > field.high:
-            raise ValueError(f"{bag.path}: topic {stream.topic} turns at up to {most:.3g} rad/s; it must be below "
-                             f"{field.high:g}. {field.remedy}")
 
 
 def _recording_name(path: Path) -> str:
@@ -288,13 +260,3 @@ def _given(config: ConvertConfig) -> dict[str, Any]:
 def _stated(config: ConvertConfig) -> Container[str] | None:
     """Fields of the vehicle that are known; None where it is built in, so that all are."""
     return None if config.vehicle in SPECS else _given(config)
-
-
-def _increasing(t: np.ndarray) -> tuple[np.ndarray, int]:
-    """Indices of the times that are later than all before, by a microsecond at least, and how many are not."""
-    keep, latest = [], -np.inf
-    for i, value in enumerate(t):
-        if value >= latest + 1e-6:
-            keep.append(i)
-            latest = value
-    return np.array(keep, int), len(t) - len(keep)

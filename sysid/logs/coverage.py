@@ -1,21 +1,18 @@
 """What a log excites, how well its drives repeat, and what therefore no fit can find in it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.backward_wheel import backward_wheel
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.directions import ALIKE, UNLIKE
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
-from sysid.logs.records import CHECK, Command, Log, Trial
-from sysid.logs.stated_sizes import wrong_sizes
+from sysid.logs.records import CHECK, Command, Log, Trial, logged_pose
 from sysid.logs.streams import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import forward_jump, pauses, set_forward, time_faults, uncommanded
 from sysid.logs.unusable import LOST, lost, said, stood
+from sysid.logs.wheel_faults import backward_wheel, wrong_sizes
 
 STILL = {"v": 0.02, "omega": 0.02}  # m/s, rad/s below which a command counts as none
 SLOW = {"v": 0.08, "omega": 0.1}  # m/s, rad/s below which dead zones and static friction show
@@ -40,8 +37,7 @@ class Excitation:
     omega: tuple[float, float]  # least and greatest yaw rate [rad/s]
     reversals: int  # changes of the driving direction
     turn_changes: int  # changes of the turning direction
-    slow_seconds: float
-    """Time at speeds or yaw rates so low that a dead zone shows, without the other channel moving faster [s]."""
+    slow_seconds: float  # time at speeds or yaw rates so low that a dead zone shows, the other channel no faster [s]
     steps: int  # changes of the command
     step_sizes: int  # distinct sizes of such changes, to 0.1 m/s and 0.1 rad/s
     acceleration: float  # greatest measured acceleration, over 0.2 s [m/s^2]
@@ -56,9 +52,9 @@ def excitation(trial: Trial) -> Excitation:
     """What one trial asks of the vehicle."""
     command = trial.command
     hold = np.maximum(np.diff(np.append(command.t, max(trial.duration, command.t[-1]))), 0.0)
-    slow = ((np.abs(command.v) > 1e-6) & (np.abs(command.v) < SLOW["v"]) & (np.abs(command.omega) < SLOW["omega"])) | (
-        (np.abs(command.omega) > 1e-6) & (np.abs(command.omega) < SLOW["omega"]) & (np.abs(command.v) < SLOW["v"]))
-    changes = np.abs(np.column_stack([np.diff(command.v), np.diff(command.omega)]))
+    v, omega = np.abs(command.v), np.abs(command.omega)
+    slow = (np.maximum(v, omega) > 1e-6) & (v < SLOW["v"]) & (omega < SLOW["omega"])
+    changes = np.abs(np.diff(command.table[:, 1:], axis=0))
     changed = changes[(changes > 1e-3).any(axis=1)]
     heading = headings = float("nan")
     if trial.ground_truth is not None:
@@ -69,8 +65,7 @@ def excitation(trial: Trial) -> Excitation:
         (float(command.v.min()), float(command.v.max())), (float(command.omega.min()), float(command.omega.max())),
         sign_changes(command.v, STILL["v"]), sign_changes(command.omega, STILL["omega"]), float(hold[slow].sum()),
         len(changed), len(np.unique(np.round(changed, 1), axis=0)), _peak_acceleration(trial),
-        float((np.abs(command.v) * hold).sum()), float((np.abs(command.omega) * hold).sum()), heading, headings,
-        standstill(command, trial.duration))
+        float((v * hold).sum()), float((omega * hold).sum()), heading, headings, standstill(command, trial.duration))
 
 
 def sign_changes(values: np.ndarray, dead: float) -> int:
@@ -80,9 +75,10 @@ def sign_changes(values: np.ndarray, dead: float) -> int:
 
 
 def _peak_acceleration(trial: Trial) -> float:
+    """Greatest measured acceleration [m/s^2]: of the odometry where there is one, since a pose is noise when it is
+    differenced twice; nan of a short trial."""
     found = [speeds(trial, channel, smooth=True) for channel in CHANNELS]
     rates = [np.abs(np.gradient(one[1], one[0])) for one in found if one is not None and len(one[0]) > 10]
-    # The outside pose, differenced twice, is noise; the odometry is preferred where there is one.
     return float(np.percentile(rates[-1], 99)) if rates else float("nan")
 
 
@@ -91,8 +87,7 @@ class ReplicateGroup:
     """How well the drives of one manoeuvre repeat."""
 
     trials: tuple[str, ...]
-    spread: dict[str, float]
-    """Standard deviation between drives by channel, like "ground_truth.x" [m], in the frame of each start."""
+    spread: dict[str, float]  # standard deviation between drives, in the frame of each start, like "ground_truth.x" [m]
 
 
 def replicate_spread(trials: tuple[Trial, ...]) -> list[ReplicateGroup]:
@@ -174,8 +169,7 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
         found += [other] if other else seen  # such a log shows neither sign nor unit
         if contradicted[channel]:
             continue
-        lengths = [(_length(trial, channel), _length_told(trial, channel)) for trial in trials]
-        ratios = [ours / commanded for ours, commanded in lengths if commanded > 1.0 and np.isfinite(ours)]
+        ratios = [ratio for trial in trials if np.isfinite(ratio := _longer(trial, channel))]
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
                          "y must be in metres, of the reference point.")
@@ -207,11 +201,10 @@ def _gains(
     One is at the delay and lag that fit best, and errs where commands are short or periodic. The other is at a usual
     delay, and errs where the vehicle follows late.
     """
-    best = [shift for one in shifts if (shift := one.get(("v", "omega")[index - 1]))]
+    best = [(shift.gain, shift.correlation) for one in shifts if (shift := one.get(("v", "omega")[index - 1]))]
     usual = [one for trial in trials if (one := _gain(trial, channel, index)) is not None]
-    both = ([(one.gain, one.correlation) for one in best], usual)
-    return [(float(np.median([gain for gain, _ in found])), float(np.median([follows for _, follows in found])))
-            for found in both if found]
+    return [(float(np.median(gains)), float(np.median(follows)))
+            for gains, follows in (zip(*both, strict=True) for both in (best, usual) if both)]
 
 
 def _gain(trial: Trial, channel: str, index: int) -> tuple[float, float] | None:
@@ -272,19 +265,15 @@ def _limit(trials: Sequence[Trial], channel: str, index: int) -> float | None:
     return limit if 0.5 < follows < 2.0 else None
 
 
-def _length(trial: Trial, channel: str) -> float:
-    stream = trial.ground_truth if channel == "ground_truth" else trial.odometry
-    if stream is None or stream.x is None or stream.y is None:
+def _longer(trial: Trial, channel: str) -> float:
+    """How many times as long a path is as the commands ask for; nan where there is none, or they ask for hardly any."""
+    pose, ideal = logged_pose(getattr(trial, channel)), logged_pose(getattr(ideal_replay(trial), channel))
+    if pose is None or ideal is None:
         return float("nan")
-    places = np.searchsorted(stream.t, np.arange(stream.t[0], stream.t[-1], 0.5))  # rows half a second apart
-    return float(np.hypot(np.diff(stream.x[places]), np.diff(stream.y[places])).sum())
-
-
-def _length_told(trial: Trial, channel: str) -> float:
-    stream = getattr(ideal_replay(trial), channel)
-    if stream is None or stream.x is None or stream.y is None:
-        return 0.0
-    return float(np.hypot(np.diff(stream.x), np.diff(stream.y)).sum())
+    rows = np.searchsorted(pose.t, np.arange(pose.t[0], pose.t[-1], 0.5))  # half a second apart
+    length, asked = (float(np.hypot(np.diff(x), np.diff(y)).sum())
+                     for x, y in ((pose.x[rows], pose.y[rows]), (ideal.x, ideal.y)))
+    return length / asked if asked > 1.0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -312,7 +301,8 @@ def blind_spots(log: Log, excitations: dict[str, Excitation]) -> list[Blind]:
         (sum(e.slow_seconds for e in found) < SLOW_SECONDS, "no slow crossing of zero",
          "dead zone of the command, static and Stribeck friction",
          "cross zero slowly in speed and in yaw rate (manoeuvre slow_sine)"),
-        (not any(e.turn_changes for e in found) and not _both_ways(found), "turns to one side only",
+        (not any(e.turn_changes for e in found) and not (
+            any(e.omega[0] < -0.1 for e in found) and any(e.omega[1] > 0.1 for e in found)), "turns to one side only",
          "track apart from a difference of the wheel radii, from an offset of the centre of mass and from gyro scale",
          "drive every turn to both sides"),
         (not any(abs(bound) > 0.1 for e in found for bound in e.omega), "no turn", "track, yaw inertia, scrub",
@@ -339,14 +329,11 @@ def blind_spots(log: Log, excitations: dict[str, Excitation]) -> list[Blind]:
         (not any(e.acceleration > 2.0 for e in found), "no hard acceleration",
          "torque limit and friction limit: they only bound what is seen",
          "brake and start at the full command, on the surface in question"),
+        (True, "velocities and poses only",
+         "mass, motor gain and battery voltage apart from one another: they act as ratios",
+         "weigh the vehicle, add a known mass, or log the motor current"),
     ]
-    always = Blind("velocities and poses only", "mass, motor gain and battery voltage apart from one another: they act "
-                   "as ratios", "weigh the vehicle, add a known mass, or log the motor current")
-    return [Blind(cause, hidden, remedy) for holds, cause, hidden, remedy in rules if holds] + [always]
-
-
-def _both_ways(found: Sequence[Excitation]) -> bool:
-    return any(e.omega[0] < -0.1 for e in found) and any(e.omega[1] > 0.1 for e in found)
+    return [Blind(*words) for holds, *words in rules if holds]
 
 
 def _few(found: Sequence[Excitation], name: str, width: float) -> bool:

@@ -4,16 +4,15 @@ It moves forward by v, and to the left and ahead by what a turn adds at a point 
 omega shows the angle between the pose's x axis and the way it travels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.records import Trial
+from sysid.logs.planar import differenced, half_span, turned_by
+from sysid.logs.records import Trial, logged_pose
+from sysid.logs.streams import GRID_DT
 
-GRID_DT, SMOOTHING = 0.02, 0.2  # s between instants, and over which a pose is differenced
 RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
 NONE = 0.02  # m/s, below which a speed is none
 VARIED = 0.03  # m/s of standard deviation of a speed that shows a direction
@@ -24,6 +23,7 @@ UNLIKE = 0.3  # of what something does not explain, that may be left with someth
 APART = 0.4  # s between samples whose errors are independent: steps are taken over half of it
 SURE = 4.0  # standard errors that an angle or a place must have
 PLAINER = 0.03  # share of the motion that speeds along the vehicle do not explain, where another frame counts
+
 
 def likeness(one: np.ndarray, other: np.ndarray, still: float = MOVING) -> float:
     """Correlation of two signals (T,); 0 where one changes by no more than `still` (standard deviation)."""
@@ -56,19 +56,14 @@ class Direction:
 
 def motion_of(trial: Trial, name: str) -> Motion | None:
     """Motion of a stream's pose beside the odometry's speeds, or the commands where there are none that move."""
-    source, odometry = getattr(trial, name), trial.odometry
-    if source is None or source.x is None or source.y is None or source.yaw is None or len(source.t) < 20:
+    pose, odometry = logged_pose(getattr(trial, name), 20), trial.odometry
+    if pose is None:
         return None
-    half = max(SMOOTHING / 2, float(np.median(np.diff(source.t))))
-    t = np.arange(source.t[0] + half, source.t[-1] - half, GRID_DT)
+    half = half_span(pose.t)
+    t = np.arange(pose.t[0] + half, pose.t[-1] - half, GRID_DT)
     if len(t) < 50:
         return None
-
-    def at(when: np.ndarray, column: np.ndarray) -> np.ndarray:
-        return np.asarray(np.interp(when, source.t, column))
-
-    steps, turn = (np.stack([at(t + half, one) - at(t - half, one) for one in columns], axis=-1) / (2 * half)
-                   for columns in ((source.x, source.y), (source.yaw,)))
+    x, y, turn = (differenced(pose.t, one, t, half) for one in pose.values.T)
     v, omega = trial.command.at(t - RESPONSE, (0.0, 0.0))
     if odometry is not None and odometry.v.std() > NONE:
         shifts = np.linspace(-half, half, 5)
@@ -76,15 +71,14 @@ def motion_of(trial: Trial, name: str) -> Motion | None:
                     for one in (odometry.v, odometry.omega))
     if v.std() < VARIED:
         return None
-    place = np.stack([at(t, source.x), at(t, source.y)], axis=-1)
-    return Motion(t, steps, place, at(t, source.yaw), turn[:, 0], v, omega)
+    place = [np.interp(t, pose.t, one) for one in pose.values.T]
+    return Motion(t, np.column_stack([x, y]), np.column_stack(place[:2]), place[2], turn, v, omega)
 
 
 def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction:
     """Direction in which a pose travels, whose point is at most `reach` off the axle's centre [m]; `mirrored`: -y."""
-    x, y = motion.steps.T * np.array([[1.0], [-1.0 if mirrored else 1.0]])
-    cos, sin = np.cos(motion.yaw), np.sin(motion.yaw)
-    along = (cos * x + sin * y) + 1j * (-sin * x + cos * y)
+    x, y = motion.steps.T
+    along = np.exp(-1j * motion.yaw) * (x + 1j * (-y if mirrored else y))
     design = np.column_stack([motion.v, motion.omega])
     gains = np.linalg.lstsq(design, along, rcond=None)[0]
     too_far = abs(gains[1]) > reach
@@ -105,10 +99,8 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
 
 def inverted(motion: Motion) -> Motion:
     """The same motion if the pose is that of the fixed frame in the vehicle's."""
-    cos, sin, half = np.cos(motion.yaw), np.sin(motion.yaw), GRID_DT / 2
-    x, y = motion.place.T
-    back = -np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
-    return replace(motion, steps=np.gradient(back, 2 * half, axis=0), place=back, yaw=-motion.yaw, turn=-motion.turn)
+    back = -np.column_stack(turned_by(*motion.place.T, -motion.yaw))
+    return replace(motion, steps=np.gradient(back, GRID_DT, axis=0), place=back, yaw=-motion.yaw, turn=-motion.turn)
 
 
 def far_point(trials: Sequence[Trial], reach: float) -> str:
@@ -140,10 +132,8 @@ def in_fixed_frame(motions: Sequence[Motion]) -> bool:
     """Whether v follows the motion along one fixed direction, and not that along the vehicle."""
     fixed, own = [], []
     for one in motions:
-        cos, sin = np.cos(one.yaw), np.sin(one.yaw)
-        x, y = one.steps.T
-        fixed.append(_explained(one.v, np.column_stack([x, y])))
-        own.append(_explained(one.v, np.column_stack([cos * x + sin * y, -sin * x + cos * y, one.turn])))
+        fixed.append(_explained(one.v, one.steps))
+        own.append(_explained(one.v, np.column_stack([*turned_by(*one.steps.T, -one.yaw), one.turn])))
     left, other = 1 - float(np.median(fixed)), 1 - float(np.median(own))
     return left < min(1 - WHOLE, UNLIKE * other) and other > PLAINER
 

@@ -1,24 +1,77 @@
 """Drives cut out of recordings: whole, or between standstills, each on a clock of its own."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
 from sysid.logs.bags.recording import OPTIONS
-from sysid.logs.conversion_options import ConvertConfig
-from sysid.logs.metrics import relative_pose
-from sysid.logs.planar import integrate_speeds
-from sysid.logs.records import PoseStream, Start, Trial
+from sysid.logs.planar import integrate_speeds, turned_by
+from sysid.logs.records import Command, PoseStream, Trial, logged_pose
+from whill_mjx.io.command_line import Range, With
 
 STILL = 1e-3  # m/s, rad/s of commands that a vehicle does not follow
 MOVING = {"v": 0.02, "omega": 0.03}  # m/s, rad/s of the odometry above which the vehicle counts as moving
 LEAD = 2.0  # s of standstill kept before and after a drive
 SHORTEST = 1.0  # s of motion below which a drive is left out
 LEFT_OUT = 0.1  # share of what was measured that a short stream costs, above which a note says so
+
+
+@dataclass(frozen=True)
+class ConvertConfig:
+    """Options of a conversion."""
+
+    source: Path
+    """ROS bag, CSV or TUM file, folder of one of them, LeRobotDataset, or a measured set."""
+    out: Path = Path("runs/dataset")
+    """Dataset folder; made where it does not exist, else the trials are added."""
+    to: Literal["dataset", "lerobot"] = "dataset"
+    """What is written: a driving-log dataset, or a LeRobotDataset v3 of a driving-log dataset."""
+    fps: Annotated[int | None, Range(1, 1000), With("to", ("lerobot",))] = None
+    """Frames per second of a LeRobotDataset that is written; by default the rate of the measurements."""
+    vehicle: str = "whill_cr"
+    """Built-in vehicle whose nominal geometry is noted, or any name with --wheel-radius and --track; measured sets know
+    their own."""
+    wheel_radius: Annotated[float | None, Range(0.001, 2)] = None
+    """Nominal wheel radius [m], where it is not the vehicle's."""
+    track: Annotated[float | None, Range(0.01, 5)] = None
+    """Nominal track [m], where it is not the vehicle's."""
+    mass: Annotated[float | None, Range(0.01, 1e4)] = None
+    """Mass [kg], where it is not the vehicle's."""
+    command_topic: str | None = None
+    """Twist or TwistStamped sent to the vehicle."""
+    odometry_topic: str | None = None
+    """The vehicle's own Odometry; '' goes without."""
+    truth_topic: str | None = None
+    """Outside measurement of the drive-axle centre: Odometry, PoseStamped, TransformStamped; '' goes without."""
+    imu_topic: str | None = None
+    """Imu with the yaw rate of the body about its z axis; '' goes without."""
+    truth_ahead: Annotated[float, Range(-10, 10)] = 0.0
+    """How far the tracked point lies ahead of the drive-axle centre [m]."""
+    truth_left: Annotated[float, Range(-10, 10)] = 0.0
+    """How far it lies to the left of it [m]."""
+    truth_turned: Annotated[float, Range(-360, 360)] = 0.0
+    """How far the tracked body's x axis is turned to the left of the vehicle's [deg]."""
+    input: Literal["auto", "commands", "wheels"] = "auto"
+    """What drives the model: commands, or measured wheel speeds (of joint states or odometry); auto takes the latter
+    where no recording has commands."""
+    stamp: Literal["receive", "header"] = "receive"
+    """Time of receipt (one clock for all), or the header's (when measured)."""
+    split: Literal["bag", "standstill"] = "bag"
+    """One trial per bag, or one per drive between standstills."""
+    pause: Annotated[float, Range(0, 3600), With("split", ("standstill",))] = 2.0
+    """Least standstill between two drives [s]."""
+    held_out: tuple[str, ...] = ()
+    """Trials that are never to be fitted."""
+    select: tuple[str, ...] = ()
+    """Part of a measured set: RUN, GROUP or robotN."""
+    columns: tuple[str, ...] = ()
+    """What columns of CSV files hold, each as ROLE=[FILE/]COLUMN[:UNIT], e.g. command.v=speed_set:km/h; the rest is
+    guessed."""
+    command_timeout: Annotated[float | None, Range(0.01, 60)] = None
+    """How long the base drives on where no command comes [s]; by default a command holds until the next."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +99,12 @@ def cut_drives(
     """The trials of one recording, whole or cut at standstill, and notes."""
     if "ground_truth" in tables:
         tables["ground_truth"] = at_axle(tables["ground_truth"], config)
-    notes = _short_stream(tables, source)
-    if config.split == "bag":
-        spans = [_shared(tables)]
-    else:
+    notes, spans = _short_stream(tables, source), [_shared(tables)]
+    if config.split == "standstill":
         spans = drive_spans(tables, config.pause)
         notes.append(f"{len(spans)} drives between standstills of {config.pause:g} s")
-    drives = []
-    for number, span in enumerate(spans, start=1):
-        name = stem if len(spans) == 1 else f"{stem}-{number:02d}"
-        drives.append(cut(name, tables, span, source))
-    return drives, notes
+    names = [stem] if len(spans) == 1 else [f"{stem}-{number:02d}" for number in range(1, len(spans) + 1)]
+    return [cut(name, tables, span, source) for name, span in zip(names, spans, strict=True)], notes
 
 
 def _measured(tables: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
@@ -85,11 +133,8 @@ def _short_stream(tables: dict[str, np.ndarray], source: Source) -> list[str]:
     return [f"{stream} covers {covers}: what was measured outside of that is left out. To keep it, {remedy}"]
 
 
-def cut(
-    name: str, tables: dict[str, np.ndarray], span: tuple[float, float], source: Source
-) -> Drive:
-    """The part of a recording between two times [s] as a trial that counts from its start, with the command then in
-    force.
+def cut(name: str, tables: dict[str, np.ndarray], span: tuple[float, float], source: Source) -> Drive:
+    """The part of a recording between two times [s] as a trial on a clock of its own, with the command then in force.
 
     Odometry is moved to start at the origin with heading 0.
     """
@@ -112,7 +157,7 @@ def cut(
     if "odometry" in found:
         found["odometry"][:, 3] = np.unwrap(found["odometry"][:, 3])
         pose = PoseStream(*found["odometry"][:, :4].T)
-        found["odometry"][:, 1:4] = relative_pose(pose, Start(*found["odometry"][0, 1:4]))
+        found["odometry"][:, 1:4] = pose.seen_from(*found["odometry"][0, 1:4]).values
     return Drive(name, found["command"], found.get("odometry"), found.get("ground_truth"), found.get("imu"))
 
 
@@ -143,10 +188,7 @@ def _motion(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Times (G,) [s] every 20 ms, and where the command or the odometry moves (G,) bool."""
     begin, end = min(table[0, 0] for table in tables.values()), max(table[-1, 0] for table in tables.values())
     t = np.arange(begin, end, 0.02)
-    command = tables["command"]
-    held = np.searchsorted(command[:, 0], t, side="right") - 1
-    commanded = np.where(held[:, None] >= 0, command[np.maximum(held, 0), 1:], 0.0)
-    moving = (np.abs(commanded[:, 0]) > STILL) | (np.abs(commanded[:, 1]) > STILL)
+    moving = (np.abs(Command(*tables["command"].T).at(t, (0.0, 0.0))) > STILL).any(axis=0)
     if "odometry" in tables:
         v, omega = (np.interp(t, tables["odometry"][:, 0], tables["odometry"][:, k]) for k in (4, 5))
         moving |= (np.abs(v) > MOVING["v"]) | (np.abs(omega) > MOVING["omega"])
@@ -155,20 +197,16 @@ def _motion(tables: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 def trial_drive(trial: Trial) -> Drive:
     """A trial in memory as tables; a window that starts in motion keeps its start pose as its first pose."""
-    odometry = pose = None
-    if trial.odometry is not None:
-        source = trial.odometry
-        x, y, yaw = (source.x, source.y, source.yaw)
-        if x is None or y is None or yaw is None:
-            x, y, yaw = integrate_speeds(source.t, source.v, source.omega)
-        odometry = np.column_stack([source.t, x, y, yaw, source.v, source.omega])
-    if trial.ground_truth is not None:
-        truth = trial.ground_truth
-        pose = np.column_stack([truth.t, truth.x, truth.y, truth.yaw])
+    odometry = pose = imu = None
+    if (source := trial.odometry) is not None:
+        logged = logged_pose(source)
+        poses = np.array(integrate_speeds(source.t, source.v, source.omega)) if logged is None else logged.values.T
+        odometry = np.column_stack([source.t, *poses, source.v, source.omega])
+    if (truth := trial.ground_truth) is not None:
+        pose = np.column_stack([truth.t, truth.values])
         if pose[0, 0] > 1e-6:
             pose = np.vstack([[0.0, trial.start.x, trial.start.y, trial.start.yaw], pose])
         pose[:, 3] = np.angle(np.exp(1j * pose[:, 3]))
-    imu = None
     if trial.gyro is not None and len(trial.gyro.t) > 1:
         imu = np.column_stack([trial.gyro.t, np.gradient(trial.gyro.turn, trial.gyro.t)])
     return Drive(re.sub(r"[^\w.-]+", "-", trial.name), trial.command.table, odometry, pose, imu)
@@ -178,10 +216,8 @@ def at_axle(truth: np.ndarray, config: ConvertConfig) -> np.ndarray:
     """Rows (T, 4) of an outside pose at the drive-axle centre and along the vehicle."""
     t, x, y, yaw = truth.T
     yaw = yaw - np.deg2rad(config.truth_turned)
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    x = x - config.truth_ahead * cos + config.truth_left * sin
-    y = y - config.truth_ahead * sin - config.truth_left * cos
-    return np.column_stack([t, x, y, np.angle(np.exp(1j * yaw))])
+    ahead, left = turned_by(config.truth_ahead, config.truth_left, yaw)
+    return np.column_stack([t, x - ahead, y - left, np.angle(np.exp(1j * yaw))])
 
 
 def _origin(tables: dict[str, np.ndarray]) -> float:

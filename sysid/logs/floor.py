@@ -5,14 +5,13 @@ how late they turn and drive, and how far they fall short. No outside pose is ne
 same are many, and a log determines their sum only: scrub, slip or a wider track. Block jackknife: Kuensch (1989).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import stats
+from scipy.signal import lfilter
 
 from sysid.logs.records import Command, Trial
 
@@ -90,11 +89,7 @@ def last_change(command: Command, t: np.ndarray) -> np.ndarray:
 
 def _lagging(signal: np.ndarray, wanted: np.ndarray, t: np.ndarray) -> np.ndarray:
     """(K, 3) sums by which any lag explains a signal (T,) as what is wanted (T,) filtered, from where it began."""
-    keep = np.exp(-DT / LAGS)
-    followed, state = np.empty((len(LAGS), len(t))), np.zeros(len(LAGS))
-    for i, target in enumerate(wanted):
-        followed[:, i] = state
-        state = keep * state + (1 - keep) * target
+    followed = np.stack([lfilter([0.0, 1 - keep], [1.0, -keep], wanted) for keep in np.exp(-DT / LAGS)])
     rest = signal - signal[0] * np.exp(-(t - t[0]) / LAGS[:, None])
     return np.stack([np.sum(followed**2, 1), np.sum(followed * rest, 1), np.sum(rest**2, 1)], axis=-1)
 
@@ -193,11 +188,10 @@ def compared(theirs: Measured, mine: Measured, freedom: float, alpha: float) -> 
         return None
     p = float(min(1.0, len(known) * 2 * stats.t.sf(np.abs(away[known]).max(), freedom)))
     far = sorted((i for i in known if abs(away[i]) > MEMBER), key=lambda i: -abs(away[i]))
-    members = tuple(_member(QUANTITIES[i], theirs.value[i], mine.value[i], mine.error[i], away[i]) for i in far)
-    return FloorChange(members, p, len(known), p < alpha)
-
-
-def _member(quantity: Quantity, before: float, after: float, error: float, away: float) -> Member:
-    ends = np.array([before, after, after - CONFIDENCE * error, after + CONFIDENCE * error])
-    first, last, low, high = (np.exp(ends) if quantity.lag else ends).tolist()
-    return Member(quantity, first, last, (low, high), float(away))
+    members = []
+    for i in far:
+        reach = CONFIDENCE * mine.error[i]
+        ends = np.array([theirs.value[i], mine.value[i], mine.value[i] - reach, mine.value[i] + reach])
+        before, after, low, high = (np.exp(ends) if QUANTITIES[i].lag else ends).tolist()
+        members.append(Member(QUANTITIES[i], before, after, (low, high), float(away[i])))
+    return FloorChange(tuple(members), p, len(known), p < alpha)

@@ -1,7 +1,5 @@
 """What a driving log holds: regularity of its streams, clocks, excitation, and what no fit can identify from it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -27,6 +25,7 @@ def inspect(log: Log) -> dict[str, Any]:
     responses = {channel: {trial.name: response_shift(trial, channel) for trial in log.trials}
                  for channel in ("odometry", "ground_truth")}
     clocks = {trial.name: clock_shift(trial) for trial in log.trials}
+    jitters = [jitter for trial in log.trials if np.isfinite(jitter := pose_jitter(trial))]
     return {
         "log": {"name": log.name, "sha256": log.sha256, "vehicle": log.spec.name, "drive": log.spec.drive,
                 "trials": len(log.trials), "held_out": [trial.name for trial in log.held_out],
@@ -39,7 +38,7 @@ def inspect(log: Log) -> dict[str, Any]:
             **{f"{channel} after command": _pooled(list(found.values())) for channel, found in responses.items()
                if any(found.values())},
             **({"ground_truth after odometry": _pooled(list(clocks.values()))} if any(clocks.values()) else {})},
-        "pose_jitter": _median([pose_jitter(trial) for trial in log.trials]),
+        "pose_jitter": float(np.median(jitters)) if jitters else float("nan"),
         "sanity": sanity(log, responses),
         "trials": [{"trial": trial.name, "group": trial.group, "manoeuvre": trial.manoeuvre, "seconds": trial.duration,
                     "held_out": trial.held_out, "excitation": asdict(excitations[trial.name]),
@@ -54,17 +53,11 @@ def inspect(log: Log) -> dict[str, Any]:
 
 def _over_trials(found: Sequence[StreamQuality]) -> dict[str, float]:
     held = [one.held for one in found if np.isfinite(one.held)]
-    return {"trials": len(found), "samples": sum(one.samples for one in found),
-            "rate": float(np.median([one.rate for one in found])),
-            "jitter": float(np.median([one.jitter for one in found])),
+    rate, jitter = (float(np.median([getattr(one, name) for one in found])) for name in ("rate", "jitter"))
+    return {"trials": len(found), "samples": sum(one.samples for one in found), "rate": rate, "jitter": jitter,
             "longest": max(one.longest for one in found), "gaps": sum(one.gaps for one in found),
             "missing": float(np.mean([one.missing for one in found])),
             "held": float(np.mean(held)) if held else float("nan")}
-
-
-def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.median(known)) if known else float("nan")
 
 
 def _pooled(found: Sequence[dict[str, Shift]]) -> dict[str, dict[str, float]]:

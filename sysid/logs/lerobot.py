@@ -11,10 +11,9 @@ A drive is an episode. Its commands are `action`, its odometry `observation.stat
 frame, and measurements are interpolated. Version 2 is read as well; it has one file for each episode.
 """
 
-from __future__ import annotations
-
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.log import read_fields, spec_from_fields
-from sysid.logs.records import Log, OdometryStream, PoseStream, Trial
+from sysid.logs.records import Log, Trial, logged_pose
 from sysid.logs.sources import LEROBOT_INFO
 from sysid.logs.tables.columns import Table
 from whill_mjx.io.fields import shown
@@ -51,24 +50,24 @@ AGAIN = "Record or download the dataset again."
 class Episodes:
     """The drives of a LeRobotDataset."""
 
-    drives: list[tuple[str, Table]]  # name and columns of each, named FEATURE/PART
-    held_out: tuple[str, ...]  # episodes of another split than train
-    spec: VehicleSpec | None  # nominal geometry, where `write` noted it
-    notes: tuple[str, ...]
+    drives: Sequence[tuple[str, Table]] = ()  # name and columns of each, named FEATURE/PART
+    held_out: tuple[str, ...] = ()  # episodes of another split than train
+    spec: VehicleSpec | None = None  # nominal geometry, where `write` noted it
+    notes: tuple[str, ...] = ()
 
 
 def read(path: Path) -> Episodes:
     """The episodes of a LeRobotDataset, v3 or v2; ValueError where it is none or pyarrow is not installed."""
-    pq = _parquet(f"{path}: reading a LeRobotDataset")
+    pa = _pyarrow(f"{path}: reading a LeRobotDataset")
     try:
-        return _read(pq, path)
+        return _read(pa, path)
     except (KeyError, IndexError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         reason = f"{type(error).__name__}: {str(error)[:LONGEST_REASON]}"
         raise ValueError(f"{path}: {LEROBOT_INFO} and the files beside it do not go together ({reason}). "
                          f"{AGAIN}") from None
 
 
-def _read(pq: Any, path: Path) -> Episodes:
+def _read(pa: Any, path: Path) -> Episodes:
     info = read_json(path / LEROBOT_INFO, "missing.", AGAIN)
     parts = _parts(path, info)
     files = sorted((path / "data").glob("*/*.parquet"))
@@ -76,16 +75,15 @@ def _read(pq: Any, path: Path) -> Episodes:
         raise ValueError(f"{path}: no data/chunk-*/*.parquet in it. {AGAIN}")
     rows: dict[int, list[dict[str, np.ndarray]]] = {}
     for file in files:
-        for number, found in _file_episodes(pq, file, parts):
+        for number, found in _file_episodes(pa, file, parts):
             rows.setdefault(number, []).append(found)
-    tasks, names = _task_names(pq, path), _trial_names(pq, path)
-    count: dict[str, int] = {}
+    tasks, names, count = _task_names(pa, path), _trial_names(pa, path), Counter[str]()
     drives, numbers = [], sorted(rows)
     for number in numbers:
         joined = {name: np.concatenate([one[name] for one in rows[number]]) for name in rows[number][0]}
         task = tasks.get(int(joined.pop("task_index", np.zeros(1))[0]), "")
         stem = re.sub(r"[^\w-]+", "_", task).strip("_")[:40] or "episode"
-        count[stem] = count.get(stem, 0) + 1
+        count[stem] += 1
         order = np.argsort(joined.pop("frame_index", joined["timestamp"]), kind="stable")
         drives.append((names.get(number, f"{stem}_{count[stem]}"),
                        Table(STEM, {name: values[order] for name, values in joined.items()})))
@@ -104,11 +102,11 @@ def write(folder: Path, log: Log, fps: int | None = None) -> list[str]:
     `fps`: frames per second; by default the rate of the measurements. ValueError where pyarrow is not installed, or
     trials differ in what was measured.
     """
-    pq = _parquet("writing a LeRobotDataset")
+    pa = _pyarrow("writing a LeRobotDataset")
     trials = (*log.training, *log.held_out)  # so that each split is one range
-    streams = ["command", *(name for name in ("odometry", "ground_truth") if getattr(trials[0], name) is not None)]
-    for trial in trials:
-        if any((getattr(trial, name) is not None) != (name in streams) for name in ("odometry", "ground_truth")):
+    having = [[stream for stream, _ in FEATURES.values() if getattr(trial, stream) is not None] for trial in trials]
+    for trial, streams in zip(trials, having, strict=True):
+        if streams != having[0]:
             raise ValueError(f"{log.name}: {trial.name} and {trials[0].name} differ in their streams; all episodes of "
                              "a LeRobotDataset have the same. Write them into datasets of their own.")
     rates = [(len(stream.t) - 1) / (stream.t[-1] - stream.t[0]) for trial in trials
@@ -118,37 +116,38 @@ def write(folder: Path, log: Log, fps: int | None = None) -> list[str]:
     tasks = list(dict.fromkeys(trial.manoeuvre for trial in trials))
     frames = [_frames(trial, fps, features) for trial in trials]
     lengths = [len(one["timestamp"]) for one in frames]
-    ends = np.cumsum(lengths)
-    for number, (one, trial) in enumerate(zip(frames, trials, strict=True)):
-        length = lengths[number]
-        one["frame_index"], one["episode_index"] = np.arange(length), np.full(length, number)
-        one["index"] = np.arange(ends[number] - length, ends[number])
-        one["task_index"] = np.full(length, tasks.index(trial.manoeuvre))
     whole = {name: np.concatenate([one[name] for one in frames]) for name in frames[0]}
-    _write_rows(pq, folder / DATA.format(chunk_index=0, file_index=0), whole, lengths)
-    _write_episodes(pq, folder, trials, lengths)
-    _write_tasks(pq, folder, tasks)
-    write_json(folder / "meta/stats.json", {name: _stats(values) for name, values in whole.items()})
+    whole |= {"frame_index": np.concatenate([np.arange(length) for length in lengths]),
+              "episode_index": np.repeat(np.arange(len(trials)), lengths), "index": np.arange(sum(lengths)),
+              "task_index": np.repeat([tasks.index(trial.manoeuvre) for trial in trials], lengths)}
+    _write_rows(pa, folder / DATA.format(chunk_index=0, file_index=0), whole, lengths)
+    _write_episodes(pa, folder, trials, lengths)
+    _write_tasks(pa, folder, tasks)
+    tables = {name: values.reshape(len(values), -1).astype(float) for name, values in whole.items()}
+    write_json(folder / "meta/stats.json", {name: {
+        **{of: getattr(table, of)(0).tolist() for of in ("min", "max", "mean", "std")}, "count": [len(table)]}
+        for name, table in tables.items()})
     write_json(folder / LEROBOT_INFO, _info(log, fps, features, tasks, lengths))
     write_fields(folder / "meta", log.spec)
-    return [f"{len(trials)} episodes of {int(ends[-1])} frames at {fps} frames/s: commands move to the nearest frame, "
+    return [f"{len(trials)} episodes of {sum(lengths)} frames at {fps} frames/s: commands move to the nearest frame, "
             f"by {500 / fps:.0f} ms at most, and measurements are interpolated"]
 
 
-def _parquet(what: str) -> Any:
-    """The module that reads and writes parquet; ValueError where it is not installed."""
+def _pyarrow(what: str) -> Any:
+    """The package that reads and writes parquet; ValueError where it is not installed."""
     try:
         import pyarrow.parquet
     except ImportError:
         raise ValueError(NEEDED.format(what=what)) from None
-    return pyarrow.parquet
+    return pyarrow
 
 
-def _read_table(pq: Any, file: Path) -> dict[str, list[Any]]:
+def _read_table(pa: Any, file: Path) -> dict[str, list[Any]]:
     """Columns of a parquet file that are no images; ValueError where it is none."""
     try:
-        names = [name for name in pq.read_schema(file).names if not name.startswith(("observation.image", "stats/"))]
-        return dict(pq.read_table(file, columns=names).to_pydict())
+        names = pa.parquet.read_schema(file).names
+        numbers = [name for name in names if not name.startswith(("observation.image", "stats/"))]
+        return dict(pa.parquet.read_table(file, columns=numbers).to_pydict())
     except (OSError, ValueError) as error:
         raise ValueError(f"{file}: is no whole parquet file ({str(error)[:120]}). {AGAIN}") from None
 
@@ -179,10 +178,10 @@ def _parts(path: Path, info: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
 
 
 def _file_episodes(
-    pq: Any, file: Path, parts: Mapping[str, tuple[str, int]]
+    pa: Any, file: Path, parts: Mapping[str, tuple[str, int]]
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Index and columns of the episodes in one file."""
-    table = _read_table(pq, file)
+    table = _read_table(pa, file)
     wanted = dict.fromkeys(feature for feature, _ in parts.values())
     missing = sorted((set(wanted) | {"episode_index"}) - set(table))
     if missing:
@@ -199,10 +198,10 @@ def _file_episodes(
         yield number, {name: values[numbers == number] for name, values in columns.items()}
 
 
-def _task_names(pq: Any, path: Path) -> dict[int, str]:
+def _task_names(pa: Any, path: Path) -> dict[int, str]:
     """Task of each task_index."""
     if (file := path / "meta/tasks.parquet").exists():
-        table = _read_table(pq, file)
+        table = _read_table(pa, file)
         texts = next((table[name] for name in ("task", "__index_level_0__") if name in table), [])
         return dict(zip(table.get("task_index", []), map(str, texts), strict=False))
     if (file := path / "meta/tasks.jsonl").exists():
@@ -214,11 +213,11 @@ def _task_names(pq: Any, path: Path) -> dict[int, str]:
     return {}
 
 
-def _trial_names(pq: Any, path: Path) -> dict[int, str]:
+def _trial_names(pa: Any, path: Path) -> dict[int, str]:
     """Name of the trial of each episode, where `write` noted it."""
     found: dict[int, str] = {}
     for file in sorted((path / "meta/episodes").glob("*/*.parquet")):
-        table = _read_table(pq, file)
+        table = _read_table(pa, file)
         if {"trial", "episode_index"} <= set(table):
             found |= dict(zip(table["episode_index"], map(str, table["trial"]), strict=True))
     return found
@@ -236,72 +235,52 @@ def _held_out(info: Mapping[str, Any], numbers: Sequence[int]) -> set[int]:
 
 def _frames(trial: Trial, fps: int, features: Mapping[str, Sequence[str]]) -> dict[str, np.ndarray]:
     """A trial on a clock of constant rate: features (T, C), and timestamp (T,)."""
-    measured = [stream for stream in (trial.odometry, trial.ground_truth) if stream is not None]
-    begin = max(float(stream.t[0]) for stream in measured)
-    end = min(float(stream.t[-1]) for stream in measured)
+    times = [stream.t for stream in (trial.odometry, trial.ground_truth) if stream is not None]
+    begin, end = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
     t = np.arange(int(np.floor((end - begin) * fps + 1e-6)) + 1) / fps
     found = {}
     for name in features:
         stream = getattr(trial, FEATURES[name][0])
         if name == "action":
             values = stream.at(begin + t + 0.5 / fps, (0.0, 0.0)).T
+        elif logged_pose(stream) is None:
+            raise ValueError(f"{trial.name}: the odometry has no pose. Convert the log to a dataset first, which dead "
+                             "reckons it.")
         else:
-            values = np.column_stack([np.interp(begin + t, stream.t, column) for column in _columns(trial, stream)])
+            values = np.column_stack([np.interp(begin + t, stream.t, column) for column in stream.values.T])
         found[name] = values.astype(np.float32)
     return {**found, "timestamp": t.astype(np.float32)}
 
 
-def _columns(trial: Trial, stream: PoseStream | OdometryStream) -> list[np.ndarray]:
-    if isinstance(stream, PoseStream):
-        return [stream.x, stream.y, stream.yaw]
-    if stream.x is None or stream.y is None or stream.yaw is None:
-        raise ValueError(f"{trial.name}: the odometry has no pose. Convert the log to a dataset first, which dead "
-                         "reckons it.")
-    return [stream.x, stream.y, stream.yaw, stream.v, stream.omega]
-
-
-def _write_rows(pq: Any, path: Path, columns: Mapping[str, np.ndarray], lengths: Sequence[int]) -> None:
+def _write_rows(pa: Any, path: Path, columns: Mapping[str, np.ndarray], lengths: Sequence[int]) -> None:
     """Write rows, one row group for each episode."""
-    import pyarrow as pa
-
     arrays = {name: pa.array(values) if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(
         pa.array(values.ravel()), values.shape[1]) for name, values in columns.items()}
-    table, start = pa.table(arrays), 0
+    table = pa.table(arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with pq.ParquetWriter(path, table.schema, compression="snappy") as writer:
-        for length in lengths:
-            writer.write_table(table.slice(start, length))
-            start += length
+    with pa.parquet.ParquetWriter(path, table.schema, compression="snappy") as writer:
+        for end, length in zip(np.cumsum(lengths), lengths, strict=True):
+            writer.write_table(table.slice(end - length, length))
 
 
-def _write_episodes(pq: Any, folder: Path, trials: Sequence[Trial], lengths: Sequence[int]) -> None:
-    import pyarrow as pa
-
+def _write_episodes(pa: Any, folder: Path, trials: Sequence[Trial], lengths: Sequence[int]) -> None:
     path = folder / "meta/episodes/chunk-000/file-000.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     ends, zeros = np.cumsum(lengths), np.zeros(len(trials), int)
-    pq.write_table(pa.table({
+    pa.parquet.write_table(pa.table({
         "episode_index": np.arange(len(trials)), "tasks": [[trial.manoeuvre] for trial in trials], "length": lengths,
         "trial": [trial.name for trial in trials], "dataset_from_index": ends - lengths, "dataset_to_index": ends,
         "data/chunk_index": zeros, "data/file_index": zeros, "meta/episodes/chunk_index": zeros,
         "meta/episodes/file_index": zeros}), path)
 
 
-def _write_tasks(pq: Any, folder: Path, tasks: Sequence[str]) -> None:
+def _write_tasks(pa: Any, folder: Path, tasks: Sequence[str]) -> None:
     """Write the table of tasks; pandas, which LeRobot reads it with, takes the task as its index."""
-    import pyarrow as pa
-
     index = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
     column = {**index, "name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
     about = {"index_columns": ["task"], "column_indexes": [], "columns": [column, index], "pandas_version": "2.0.0"}
     table = pa.table({"task_index": np.arange(len(tasks)), "task": list(tasks)})
-    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), folder / "meta/tasks.parquet")
-
-
-def _stats(values: np.ndarray) -> dict[str, list[float]]:
-    table = values.reshape(len(values), -1).astype(float)
-    return {"min": table.min(0).tolist(), "max": table.max(0).tolist(), "mean": table.mean(0).tolist(),
-            "std": table.std(0).tolist(), "count": [len(table)]}
+    pa.parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), folder / "meta/tasks.parquet")
 
 
 def _info(log: Log, fps: int, features: Mapping[str, Sequence[str]], tasks: Sequence[str], lengths: Sequence[int]

@@ -4,8 +4,6 @@ Every stream keeps its own clock, as real logs do. All quantities are SI, yaw is
 reference point: the centre of the driven axle (the vehicle's centre for skid drive).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.gyro import with_sign
-from sysid.logs.hashes import hash_files
 from sysid.logs.records import (
     Command,
     GyroStream,
@@ -22,7 +19,9 @@ from sysid.logs.records import (
     PoseStream,
     Start,
     Trial,
+    hash_files,
     held_from_middle,
+    logged_pose,
     manoeuvre_of,
     with_timeout,
 )
@@ -79,71 +78,51 @@ def load_log(folder: str | Path) -> Log:
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
     """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never)."""
-    command_columns = read_csv(folder / "command.csv", COMMAND_COLUMNS)
-    command = Command(**{name: command_columns[name] for name in COMMAND_COLUMNS})
-    odometry = ground_truth = None
-    if (folder / "odometry.csv").exists():
-        columns = read_csv(folder / "odometry.csv", ODOMETRY_COLUMNS)
-        odometry = OdometryStream(**{name: columns[name] for name in ODOMETRY_COLUMNS})
-    if (folder / "ground_truth.csv").exists():
-        columns = read_csv(folder / "ground_truth.csv", POSE_COLUMNS)
-        ground_truth = PoseStream(**{name: columns[name] for name in POSE_COLUMNS})
-    if odometry is None and ground_truth is None:
-        gyro = " imu.csv alone shows no speed." * (folder / "imu.csv").exists()
+    command = Command(**read_csv(folder / "command.csv", COMMAND_COLUMNS))
+    measured: dict[str, Any] = {
+        name: kind(**read_csv(path, columns)) for name, kind, columns in (
+            ("odometry", OdometryStream, ODOMETRY_COLUMNS), ("ground_truth", PoseStream, POSE_COLUMNS))
+        if (path := folder / f"{name}.csv").exists()}
+    imu = folder / "imu.csv"
+    if not measured:
         raise ValueError(f"{folder}: neither odometry.csv nor ground_truth.csv. A trial needs at least one of them."
-                         f"{gyro}")
-    _check_seconds(folder, {name: one.t for name, one in (("command.csv", command), ("odometry.csv", odometry), (
-        "ground_truth.csv", ground_truth)) if one is not None})
-    for name, stream in (("odometry.csv", odometry), ("ground_truth.csv", ground_truth)):
-        if stream is not None:
-            _check_way(folder / name, stream, odometry or command)
-            _check_reach(folder / name, stream, command)  # before unwrapping, which would hide degrees
-    if odometry is not None and odometry.yaw is not None:
-        odometry = replace(odometry, yaw=np.unwrap(odometry.yaw))
-    if ground_truth is not None:
-        ground_truth = replace(ground_truth, yaw=np.unwrap(ground_truth.yaw))
+                         f"{' imu.csv alone shows no speed.' * imu.exists()}")
+    _check_seconds(folder, {f"{name}.csv": one.t for name, one in {"command": command, **measured}.items()})
+    for name, stream in measured.items():
+        _check_way(folder / f"{name}.csv", stream, measured.get("odometry", command))
+        _check_reach(folder / f"{name}.csv", stream, command)  # before unwrapping, which would hide degrees
+    odometry, ground_truth = (None if (one := measured.get(name)) is None else replace(one, yaw=np.unwrap(one.yaw))
+                              for name in ("odometry", "ground_truth"))
     if timeout is not None:
         command = with_timeout(command, timeout)
     trial = make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
-    return replace(trial, gyro=_read_gyro(folder / "imu.csv", trial.duration))
-
-
-def _read_gyro(path: Path, end: float) -> GyroStream | None:
-    """What a gyro turned until a time [s]; None where there is no file, or fewer than two samples in it."""
-    if not path.exists():
-        return None
-    columns = read_csv(path, GYRO_COLUMNS)
-    inside = (columns["t"] >= 0) & (columns["t"] <= end)
-    if inside.sum() < 2:
-        return None
-    return GyroStream.of_rates(columns["t"][inside], columns["gyro"][inside])
+    if not imu.exists():
+        return trial
+    t, rates = read_csv(imu, GYRO_COLUMNS).values()
+    inside = (t >= 0) & (t <= trial.duration)
+    return trial if inside.sum() < 2 else replace(trial, gyro=GyroStream.of_rates(t[inside], rates[inside]))
 
 
 def make_trial(
     name: str, command: Command, odometry: OdometryStream | None, ground_truth: PoseStream | None,
     held_out: bool = False,
 ) -> Trial:
-    """A trial with its start: the mean pose over at most one second of standstill before the first command; the
-    odometry is counted from there. A first command that already moves starts in motion, at the first sample and the
-    speeds of the odometry, or else those commanded."""
+    """A trial with its start: the mean pose over at most one second of standstill before the first command.
+
+    The odometry is counted from there. A first command that already moves starts in motion, at the first sample and
+    the speeds of the odometry, or else those commanded.
+    """
     moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
     still = float(min(command.t[moving[0]] if len(moving) else np.inf, command.t[0] + STANDSTILL))
     v, omega = _start_speeds(command, odometry)
     start = Start(v=v, omega=omega, rest=still)
     if ground_truth is not None:
-        rest = _rest(ground_truth.t, still)
-        x, y, yaw = ground_truth.x[rest], ground_truth.y[rest], ground_truth.yaw[rest]
-        position_sigma, yaw_sigma = _standard_errors(x, y, yaw)
-        start = Start(float(x.mean()), float(y.mean()), float(yaw.mean()), v, omega, position_sigma, yaw_sigma,
-                      rest=still)
-    if odometry is not None and odometry.x is not None and odometry.y is not None and odometry.yaw is not None:
-        rest = _rest(odometry.t, still)
-        position_sigma, yaw_sigma = _standard_errors(odometry.x[rest], odometry.y[rest], odometry.yaw[rest])
+        place, position_sigma, yaw_sigma = _at_rest(ground_truth, still)
+        start = Start(*place, v, omega, position_sigma, yaw_sigma, rest=still)
+    if odometry is not None and (pose := logged_pose(odometry)) is not None:
+        place, position_sigma, yaw_sigma = _at_rest(pose, still)
         start = replace(start, odometry_position_sigma=position_sigma, odometry_yaw_sigma=yaw_sigma)
-        x, y = odometry.x - odometry.x[rest].mean(), odometry.y - odometry.y[rest].mean()
-        yaw0 = odometry.yaw[rest].mean()
-        cos, sin = np.cos(yaw0), np.sin(yaw0)
-        odometry = replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
+        odometry = replace(odometry, **vars(pose.seen_from(*place)))
     return Trial(name, manoeuvre_of(name), command, odometry, ground_truth, start, held_out)
 
 
@@ -243,26 +222,23 @@ def _check_seconds(folder: Path, times: dict[str, np.ndarray]) -> None:
                          f"{' in all streams' if not others and len(times) > 1 else ''}.")
 
 
-def _check_way(path: Path, stream: OdometryStream | PoseStream, speeds: OdometryStream | Command) -> None:
+def _check_way(path: Path, stream: Any, speeds: OdometryStream | Command) -> None:
     """Refuse poses that are as much shorter a way than the speeds give as seconds are longer than a smaller unit."""
-    if len(stream.t) < LEAST_ROWS or stream.x is None or stream.y is None or stream.yaw is None:
+    if len(t := stream.t) < LEAST_ROWS or not DOUBTED <= float(np.median(np.diff(t))) <= SLOWEST:
         return
-    if not DOUBTED <= float(np.median(np.diff(stream.t))) <= SLOWEST:
-        return
-    steps = np.hypot(np.diff(stream.x), np.diff(stream.y)), np.abs(np.diff(np.unwrap(stream.yaw)))
+    yaw, few = np.unwrap(stream.yaw), np.linspace(0, len(t) - 1, min(len(t), WAY_POINTS)).astype(int)
+    steps, (way, turn) = ((np.hypot(np.diff(stream.x[rows]), np.diff(stream.y[rows])), np.abs(np.diff(yaw[rows])))
+                          for rows in (slice(None), few))  # noise adds up in many
     if all(float(np.median(one)) < STANDS for one in steps):
         return  # most of the time the vehicle stood, which explains the short way
-    few = np.linspace(0, len(stream.t) - 1, min(len(stream.t), WAY_POINTS)).astype(int)  # noise adds up in many
-    way = float(np.hypot(np.diff(stream.x[few]), np.diff(stream.y[few])).sum())
-    turn = float(np.abs(np.diff(np.unwrap(stream.yaw)[few])).sum())
-    inside = (speeds.t >= stream.t[0]) & (speeds.t <= stream.t[-1])
-    held = np.diff(np.append(speeds.t[inside], stream.t[-1]))
-    for moved, speed, unit in ((way, speeds.v, "m"), (turn, speeds.omega, "rad")):
+    inside = (speeds.t >= t[0]) & (speeds.t <= t[-1])
+    held = np.diff(np.append(speeds.t[inside], t[-1]))
+    for moved, speed, unit in ((float(way.sum()), speeds.v, "m"), (float(turn.sum()), speeds.omega, "rad")):
         said = float((np.abs(speed[inside]) * held).sum())
         times = said / moved if moved > LEAST_WAY else 0.0
         for name, size in TIME_UNITS:
             if size / UNLIKE < times < size * UNLIKE:
-                raise ValueError(f"{path}: the speeds give {said:.3g} {unit} in {np.ptp(stream.t):.5g} s, the "
+                raise ValueError(f"{path}: the speeds give {said:.3g} {unit} in {np.ptp(t):.5g} s, the "
                                  f"poses {moved:.3g} {unit}: t seems to be in {name}. Divide t by {size:.0f} in all "
                                  "streams.")
 
@@ -291,15 +267,12 @@ def _start_speeds(command: Command, odometry: OdometryStream | None) -> tuple[fl
     return speeds if max(abs(speeds[0]), abs(speeds[1])) > START_NOISE else (0.0, 0.0)
 
 
-def _rest(t: np.ndarray, still: float) -> np.ndarray:
-    """Indices of the samples before the vehicle moves; the first sample where there is none."""
-    indices = np.flatnonzero(t <= still)
-    return indices if len(indices) else np.array([0])
-
-
-def _standard_errors(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[float, float]:
-    """Of the mean position, per axis, and of the mean yaw over samples (M,) at rest; 0 of a single sample."""
-    if len(x) < 2:
-        return 0.0, 0.0
-    position = np.sqrt((x.var(ddof=1) + y.var(ddof=1)) / 2 / len(x))
-    return float(position), float(np.sqrt(yaw.var(ddof=1) / len(x)))
+def _at_rest(pose: PoseStream, still: float) -> tuple[tuple[float, float, float], float, float]:
+    """Mean pose until the vehicle moves [s], at least of the first sample, and standard errors of x and y, and of yaw;
+    0 of a single sample."""
+    rows = pose.values[: max(int((pose.t <= still).sum()), 1)]
+    x, y, yaw = (float(one.mean()) for one in rows.T)
+    if len(rows) < 2:
+        return (x, y, yaw), 0.0, 0.0
+    along_x, along_y, turn = (one.var(ddof=1) for one in rows.T)
+    return (x, y, yaw), float(np.sqrt((along_x + along_y) / 2 / len(rows))), float(np.sqrt(turn / len(rows)))

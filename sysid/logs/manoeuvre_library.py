@@ -4,8 +4,6 @@ All begin and end with a second of standstill. Those of `whill_mjx.logs.manoeuvr
 pseudo-random steps, chirps, ladders of step sizes, stop and go, slow yaw, and a square along four headings.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.logs.metrics import ideal_replay
+from sysid.logs.planar import turned_by
 from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL, Pieces, Scenario
 
@@ -27,18 +26,12 @@ class Limits:
     """What a manoeuvre may use."""
 
     v_min: float = -1.0
-    v_max: float = 1.0
-    """Speeds [m/s]; a vehicle that must not reverse has v_min = 0."""
-    omega_max: float = 1.0
-    """Yaw rate [rad/s]."""
-    room: tuple[float, float] = (8.0, 8.0)
-    """Length and width [m] of the free floor."""
-    margin: float = 0.6
-    """How far the drive-axle centre stays from its edges [m]: the reach of the body."""
-    seconds: float = 20.0
-    """Time in motion at most [s]."""
-    dt: float = 0.1
-    """Command period [s]."""
+    v_max: float = 1.0  # speeds [m/s]; a vehicle that must not reverse has v_min = 0
+    omega_max: float = 1.0  # yaw rate [rad/s]
+    room: tuple[float, float] = (8.0, 8.0)  # length and width [m] of the free floor
+    margin: float = 0.6  # how far the drive-axle centre stays from its edges [m]: the reach of the body
+    seconds: float = 20.0  # time in motion at most [s]
+    dt: float = 0.1  # command period [s]
 
     def __post_init__(self) -> None:
         if not (self.v_max > 0 and self.v_min <= 0 and self.omega_max > 0):
@@ -185,8 +178,7 @@ def placement(path: np.ndarray, limits: Limits) -> tuple[float, float, float] | 
     length, width = (side - 2 * limits.margin for side in limits.room)
     best: tuple[float, tuple[float, float, float]] | None = None
     for yaw in np.deg2rad(np.arange(0.0, 180.0, 5.0)):
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        x, y = cos * path[:, 0] - sin * path[:, 1], sin * path[:, 0] + cos * path[:, 1]
+        x, y = turned_by(*path.T, yaw)
         spare = min(length - float(np.ptp(x)), width - float(np.ptp(y)))
         if spare >= 0 and (best is None or spare > best[0] + 1e-9):
             place = (limits.room[0] / 2 - float(x.max() + x.min()) / 2, limits.room[1] / 2 - float(

@@ -1,7 +1,5 @@
 """One loader of all logs that a fit can read: datasets, and two published measured sets in their original form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ from sysid.logs.command_timeout import with_own_timeout
 from sysid.logs.log import load_log
 from sysid.logs.published.drive_norlab import load_drive, most_runs
 from sysid.logs.published.mrclam import ROBOTS, load_mrclam, mrclam_files, mrclam_robots
-from sysid.logs.records import Log, Trial
+from sysid.logs.records import Log
 from sysid.logs.sources import about
 from sysid.logs.streams import without_held
 from sysid.logs.unusable import without_lost, without_standing
@@ -106,11 +104,9 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
 
 def _without_held(log: Log) -> Log:
     """The log without held rows, and a note where there were any."""
-    def rows(trial: Trial) -> int:
-        return sum(len(stream.t) for stream in (trial.odometry, trial.ground_truth) if stream is not None)
-
     trials = tuple(without_held(trial) for trial in log.trials)
-    before, after = sum(map(rows, log.trials)), sum(map(rows, trials))
+    before, after = (sum(len(stream.t) for trial in some for stream in (trial.odometry, trial.ground_truth)
+                         if stream is not None) for some in (log.trials, trials))
     if after == before:
         return log
     return replace(log, trials=trials, notes=(*log.notes,

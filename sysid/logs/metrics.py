@@ -5,21 +5,11 @@ Frames: the simulation starts at the measured start pose in the room frame, whic
 are scored apart: a vehicle whose wheels slip has two different motions.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.logs.records import (
-    Command,
-    OdometryStream,
-    PoseStream,
-    Prediction,
-    Start,
-    Trial,
-    manoeuvre_of,
-)
+from sysid.logs.records import Command, OdometryStream, PoseStream, Prediction, Start, Trial, logged_pose, manoeuvre_of
 from sysid.logs.replicates import same_course, shifts
 
 
@@ -54,7 +44,7 @@ def errors_of(trial: Trial, prediction: Prediction) -> dict[str, dict[str, tuple
         if measured is None or simulated is None:
             continue
         mine = {}
-        if measured.x is not None and measured.y is not None and measured.yaw is not None:
+        if logged_pose(measured) is not None:
             mine["trajectory"] = measured.t, np.hypot(simulated.x - measured.x, simulated.y - measured.y)
             mine["yaw"] = measured.t, simulated.yaw - measured.yaw
         if channel == "odometry":
@@ -99,13 +89,6 @@ def integrate(command: Command, start: Start, t: np.ndarray) -> tuple[np.ndarray
     return x[k] + dx, y[k] + dy, yaw[k] + omega[k] * rest
 
 
-def relative_pose(stream: PoseStream, start: Start) -> np.ndarray:
-    """(T, 3) pose in the frame of the trial's start."""
-    cos, sin = np.cos(start.yaw), np.sin(start.yaw)
-    dx, dy = stream.x - start.x, stream.y - start.y
-    return np.stack([cos * dx + sin * dy, -sin * dx + cos * dy, stream.yaw - start.yaw], axis=-1)
-
-
 def replicate_groups(trials: tuple[Trial, ...]) -> list[list[Trial]]:
     """Trials that are true replicates: of one manoeuvre with the same commands after its first motion, two at least."""
     numbered = [trial for trial in trials if trial.name != trial.manoeuvre == manoeuvre_of(trial.name)]
@@ -113,8 +96,7 @@ def replicate_groups(trials: tuple[Trial, ...]) -> list[list[Trial]]:
 
 
 def replicate_noise(trials: tuple[Trial, ...]) -> dict[str, np.ndarray] | None:
-    """Pooled standard deviation between replicates, which no model of the mean motion can beat; None without
-    replicates.
+    """Pooled standard deviation between replicates, which no model of the mean motion can beat; None without any.
 
     "ground_truth" (3,) of x, y [m], yaw [rad] and "odometry" (5,) of x, y, yaw, v, omega, in the frame of each trial's
     start; channels without data are nan.
@@ -126,11 +108,10 @@ def replicate_noise(trials: tuple[Trial, ...]) -> dict[str, np.ndarray] | None:
     counts = {"ground_truth": 0.0, "odometry": 0.0}
     for group in groups:
         for channel in CHANNELS:
-            streams = [_relative(trial, channel) for trial in group]
-            if any(stream is None for stream in streams):
+            known = [(stream.t - shift, stream.values) for trial, shift in zip(group, shifts(group), strict=True)
+                     if (stream := _from_start(trial, channel)) is not None]
+            if len(known) < len(group):
                 continue
-            known = [(stream[0] - shift, stream[1]) for stream, shift in zip(streams, shifts(group), strict=True)
-                     if stream is not None]
             begin, end = max(t[0] for t, _ in known), min(t[-1] for t, _ in known)
             t = known[0][0][(known[0][0] >= begin) & (known[0][0] <= end)]
             values = np.stack([np.stack([np.interp(t, time, column) for column in table.T], axis=-1)
@@ -147,21 +128,16 @@ def noise_floor(trials: tuple[Trial, ...]) -> dict[str, dict[str, float | None]]
     if noise is None:
         return None
 
-    def finite(value: float) -> float | None:
-        return float(value) if np.isfinite(value) else None
-
-    truth, odometry = noise["ground_truth"], noise["odometry"]
-    return {
-        "ground_truth": {"trajectory": finite(np.hypot(truth[0], truth[1])), "velocity": None,
-                         "angular_velocity": None, "yaw": finite(truth[2])},
-        "odometry": {"trajectory": finite(np.hypot(odometry[0], odometry[1])), "velocity": finite(odometry[3]),
-                     "angular_velocity": finite(odometry[4]), "yaw": finite(odometry[2])},
-    }
+    floor = {}
+    for channel in CHANNELS:
+        x, y, yaw, v, omega = [*noise[channel], np.nan, np.nan][:5]
+        values = zip(METRICS, (np.hypot(x, y), v, omega, yaw), strict=True)
+        floor[channel] = {metric: float(value) if np.isfinite(value) else None for metric, value in values}
+    return floor
 
 
 def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, float | None]]:
-    """channel -> metric -> mean over the training or the held-out trials of what replicates of each differ by; else
-    empty.
+    """channel -> metric -> mean over the training or held-out trials of what replicates of each differ by, if any.
 
     Replicates count whichever part they are in: drives that turn a lot differ by far more than others.
     """
@@ -177,12 +153,12 @@ def own_floor(trials: tuple[Trial, ...], held_out: bool) -> dict[str, dict[str, 
     return out
 
 
-def _relative(trial: Trial, channel: str) -> tuple[np.ndarray, np.ndarray] | None:
-    if channel == "ground_truth":
-        if trial.ground_truth is None:
-            return None
-        return trial.ground_truth.t, relative_pose(trial.ground_truth, trial.start)
-    return None if trial.odometry is None else (trial.odometry.t, trial.odometry.values)
+def _from_start(trial: Trial, channel: str) -> PoseStream | OdometryStream | None:
+    """A stream whose poses are in the frame of the trial's start, as those of the odometry are."""
+    start, pose = trial.start, trial.ground_truth
+    if channel == "odometry" or pose is None:
+        return getattr(trial, channel)
+    return pose.seen_from(start.x, start.y, start.yaw)
 
 
 def _arc(v: np.ndarray, omega: np.ndarray, yaw: np.ndarray, dt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

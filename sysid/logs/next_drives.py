@@ -3,8 +3,6 @@
 They are scripts, `t,v,omega` as in command.csv, for `bridge.manoeuvre`. No vehicle model is asked.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -82,10 +80,10 @@ def needed_floor(command: Command, radius: float) -> tuple[float, float]:
     """Length and width of the floor that a vehicle may need for commands, along its first heading and across it [m]:
     with errors of UNCERTAINTY, the body's radius, and what is driven until a stop takes effect."""
     t = np.arange(0.0, command.t[-1] + STEP, STEP)
-    held = np.maximum(np.searchsorted(command.t, t + 1e-9, side="right") - 1, 0)
+    v, omega = command.at(t)
     low, high = np.full(2, -radius), np.full(2, radius)
     for faster, sharper in product((-UNCERTAINTY, 0.0, UNCERTAINTY), repeat=2):
-        speed, rate = (1 + faster) * command.v[held], (1 + sharper) * command.omega[held]
+        speed, rate = (1 + faster) * v, (1 + sharper) * omega
         heading = np.cumsum(rate) * STEP - rate * STEP / 2
         place = np.cumsum(speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0) * STEP
         margin = radius + np.abs(speed)[:, None] * REACTION

@@ -4,14 +4,12 @@ A row's stamp is up to a frame later than what it says: at 1 m/s and 20 ms, 2 cm
 row they show in steady driving, as uneven steps. Ages that all rows share do not; a fit has `sensor_delay` for them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.records import Trial, command_in_force
+from sysid.logs.records import Trial, command_in_force, logged_pose
 from sysid.replay.cores import on_all_cores
 
 ROWS = 8  # of a stretch of steady driving, in which what a parabola over time does not explain is explained by the ages
@@ -56,8 +54,7 @@ def find_period(trials: Sequence[Trial]) -> float | None:
     known = [part for part in (stretches(trials[i], i) for i in chosen) if part is not None]
     if not known:
         return None
-    part = Stretches(*(np.concatenate([getattr(one, name) for one in known]) for name in
-                       ("t", "parabola", "steps", "weight", "trial")))
+    part = Stretches(*map(np.concatenate, zip(*(vars(one).values() for one in known), strict=True)))
     spacing = float(np.median(np.diff(part.t)))
     if len(part.t) < STRETCHES or spacing <= SHORTEST:
         return None
@@ -81,8 +78,8 @@ def stretches(trial: Trial, number: int = 0, largest: float | None = None) -> St
 
     `largest`: step that a steady stretch may have [s]; by default its command must have been in force for a while.
     """
-    stream = trial.odometry
-    if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < ROWS:
+    stream = logged_pose(trial.odometry, ROWS)
+    if stream is None:
         return None
     middle = (stream.yaw[1:] + stream.yaw[:-1]) / 2
     way = np.cos(middle) * np.diff(stream.x) + np.sin(middle) * np.diff(stream.y)
@@ -136,7 +133,7 @@ def _best_rate(
 ) -> tuple[float, float, float]:
     """Of rates (N,) [1/s], the one that leaves least in groups (S,) of stretches, and between which all are as good."""
     order = np.argsort(group, kind="stable")
-    part = Stretches(*(getattr(part, name)[order] for name in ("t", "parabola", "steps", "weight", "trial")))
+    part = Stretches(*(column[order] for column in vars(part).values()))
     left = np.array(on_all_cores(lambda rate: unexplained(part, 1 / rate, group[order], phases), rates.tolist()))
     worse = np.flatnonzero(left > left.min() + SAME * np.square(part.weight * part.steps).sum())
     best = int(np.argmin(left))

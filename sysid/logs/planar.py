@@ -1,6 +1,4 @@
-"""Motion in the plane: the heading of a quaternion, the speeds of a pose, and the pose that speeds add up to."""
-
-from __future__ import annotations
+"""Motion in the plane: headings of quaternions, poses in other frames, speeds of poses, and what speeds add up to."""
 
 import numpy as np
 
@@ -22,9 +20,27 @@ def twist_of_wheels(
     return wheel_radius * (left + right) / 2, wheel_radius * (right - left) / track
 
 
+def turned_by(
+    x: np.ndarray | float, y: np.ndarray | float, angle: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """x and y (T,) or () turned to the left by angles (T,) or () [rad]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return cos * x - sin * y, sin * x + cos * y
+
+
+def half_span(t: np.ndarray) -> float:
+    """Half of the time [s] over which a pose at times (T,) is differenced."""
+    return max(DIFFERENCED / 2, float(np.median(np.diff(t))))
+
+
+def differenced(t: np.ndarray, values: np.ndarray, when: np.ndarray, half: float) -> np.ndarray:
+    """Rates (G,) of values (T,) at times `when` (G,), between half a span before and after [s]."""
+    return np.asarray((np.interp(when + half, t, values) - np.interp(when - half, t, values)) / (2 * half))
+
+
 def pose_speeds(t: np.ndarray, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Forward speed and yaw rate (T,) of a pose (T,) whose yaw does not wrap, over `DIFFERENCED` seconds."""
-    half = max(DIFFERENCED / 2, float(np.median(np.diff(t))))
+    half = half_span(t)
     low, high = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
     dx, dy, turn = (np.interp(high, t, one) - np.interp(low, t, one) for one in (x, y, yaw))
     return (np.cos(yaw) * dx + np.sin(yaw) * dy) / (high - low), turn / (high - low)
@@ -42,11 +58,15 @@ def without_wraps(angle: np.ndarray) -> np.ndarray:
     return np.concatenate([angle[:1], angle[0] + np.cumsum(steps)])
 
 
+def added_up(when: np.ndarray, rate: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """What a rate (T,) at times `when` (T,) [s] adds up to at times t (M,) from its first; before it was as then."""
+    added = np.append(0.0, np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(when)))
+    return np.asarray(np.interp(t, when, added) + np.minimum(t - when[0], 0.0) * rate[0])
+
+
 def integrate_speeds(t: np.ndarray, v: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Dead reckoning of speeds (T,): x, y and yaw that an odometry would report that only logged its wheels."""
-    dt = np.diff(t)
-    turn = (omega[1:] + omega[:-1]) / 2 * dt
-    yaw = np.concatenate([[0.0], np.cumsum(turn)])
-    step, middle = (v[1:] + v[:-1]) / 2 * dt, yaw[:-1] + turn / 2
-    return (np.concatenate([[0.0], np.cumsum(step * np.cos(middle))]),
-            np.concatenate([[0.0], np.cumsum(step * np.sin(middle))]), yaw)
+    yaw, steps = added_up(t, omega, t), (v[1:] + v[:-1]) / 2 * np.diff(t)
+    middle = (yaw[1:] + yaw[:-1]) / 2
+    x, y = (np.append(0.0, np.cumsum(steps * turn(middle))) for turn in (np.cos, np.sin))
+    return x, y, yaw

@@ -5,8 +5,6 @@ found from whole drives. A gyro settles it. The odometry shows the wheels, and a
 late pose: the delay then has to beat a first-order lag. Before a drive the vehicle went on as in its first instant.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -31,8 +29,7 @@ class PoseLag:
     delay: float  # of all drives [s]
     low: float
     high: float  # 95 % interval of it, from blocks left out in turn [s]
-    p: float
-    """Probability of so much better a prediction of held-back blocks if the delay meant nothing: signs of blocks."""
+    p: float  # of so much better a prediction of held-back blocks if the delay meant nothing, by the signs of blocks
     share: float  # share of the held-back error that it removes
 
 
@@ -99,9 +96,8 @@ def _sums(trial: Trial, rates: Rates | None) -> tuple[np.ndarray, np.ndarray] | 
     if pose is None or rates is None and odometry is None or rates is not None and trial.name not in rates:
         return None
     start = trial.start
-    t = np.concatenate([[0.0], pose.t])
-    x, y, yaw = (np.concatenate([[first], rest]) for first, rest in (
-        (start.x, pose.x), (start.y, pose.y), (start.yaw, pose.yaw)))
+    t = np.append(0.0, pose.t)
+    x, y, yaw = np.vstack([[start.x, start.y, start.yaw], pose.values]).T
     signals = [(*rates[trial.name], yaw)] if rates is not None else [
         (odometry.t, odometry.omega, yaw), (odometry.t, odometry.v, _forward(x, y, yaw))]  # type: ignore[union-attr]
     piece = np.zeros(len(t), int)  # between breaks
@@ -128,8 +124,7 @@ def _moments(
 def _forward(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """Way (M,) along the heading [m]."""
     middle = (yaw[1:] + yaw[:-1]) / 2
-    steps = np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return np.append(0.0, np.cumsum(np.diff(x) * np.cos(middle) + np.diff(y) * np.sin(middle)))
 
 
 def _lagged(t: np.ndarray, rate: np.ndarray, constant: float) -> np.ndarray:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.vehicle.specs import VehicleSpec
 
 GYRO_SPACING = 0.05
 """Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
-CHECK = "Check the log: "
-"""Begins a note on a fault of a log."""
-
-
-CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}
-"""What a person calls a channel of a trial."""
+CHECK = "Check the log: "  # begins a note on a fault of a log
+CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}  # what a person calls a channel of a trial
 
 
 @dataclass(frozen=True)
@@ -74,6 +73,18 @@ class PoseStream:
         """(T, 3) of x, y [m] and yaw [rad]."""
         return np.stack([self.x, self.y, self.yaw], axis=-1)
 
+    def seen_from(self, x: float, y: float, yaw: float) -> PoseStream:
+        """The same poses in the frame of another one."""
+        place = np.exp(-1j * yaw) * (self.x - x + 1j * (self.y - y))
+        return PoseStream(self.t, place.real, place.imag, self.yaw - yaw)
+
+
+def logged_pose(stream: OdometryStream | PoseStream | None, rows: int = 0) -> PoseStream | None:
+    """The pose of a stream; None where it was not logged, or in fewer rows."""
+    if stream is None or stream.x is None or stream.y is None or stream.yaw is None or len(stream.t) < rows:
+        return None
+    return PoseStream(stream.t, stream.x, stream.y, stream.yaw)
+
 
 @dataclass(frozen=True)
 class GyroStream:
@@ -85,13 +96,8 @@ class GyroStream:
     @classmethod
     def of_rates(cls, t: np.ndarray, omega: np.ndarray) -> GyroStream:
         """That of yaw rates (T,) [rad/s], at samples that are at least `GYRO_SPACING` apart."""
-        turn = np.concatenate([[0.0], np.cumsum(np.diff(t) * (omega[1:] + omega[:-1]) / 2)])
-        kept, last = [], -np.inf
-        for i, now in enumerate(t):
-            if now - last >= GYRO_SPACING - 1e-9:
-                kept.append(i)
-                last = now
-        return cls(t[kept], turn[kept])
+        kept = spaced(t, GYRO_SPACING - 1e-9)
+        return cls(t[kept], np.append(0.0, np.cumsum((omega[1:] + omega[:-1]) / 2 * np.diff(t)))[kept])
 
     @property
     def values(self) -> np.ndarray:
@@ -108,18 +114,12 @@ class Start:
     yaw: float = 0.0
     v: float = 0.0
     omega: float = 0.0
-    position_sigma: float = 0.0
-    """Standard error of x and y [m]."""
-    yaw_sigma: float = 0.0
-    """Standard error of yaw [rad]."""
-    odometry_position_sigma: float = 0.0
-    """Standard error of the origin from which the odometry counts x and y [m]."""
-    odometry_yaw_sigma: float = 0.0
-    """Standard error of the heading from which it counts yaw, and along which x points [rad]."""
-    measured: bool = False
-    """Whether the pose is the outside measurement at t = 0 itself."""
-    rest: float = 0.0
-    """Until when poses were averaged for it [s]."""
+    position_sigma: float = 0.0  # standard error of x and y [m]
+    yaw_sigma: float = 0.0  # standard error of yaw [rad]
+    odometry_position_sigma: float = 0.0  # standard error of the origin from which the odometry counts x and y [m]
+    odometry_yaw_sigma: float = 0.0  # standard error of the heading from which it counts yaw, and along which x points
+    measured: bool = False  # whether the pose is the outside measurement at t = 0 itself
+    rest: float = 0.0  # until when poses were averaged for it [s]
 
 
 @dataclass(frozen=True)
@@ -201,6 +201,32 @@ class Log:
     def select(self, keep: Callable[[Trial], bool]) -> Log:
         """The same log with only the trials that `keep` accepts."""
         return replace(self, trials=tuple(trial for trial in self.trials if keep(trial)))
+
+
+def hash_files(folder: Path) -> str:
+    """SHA-256 over names and contents of all data files of a dataset."""
+    digest = hashlib.sha256()
+    results = {path.parent for path in folder.rglob(RUN_FILE)}  # of commands that were given a place in here
+    for path in sorted(folder.rglob("*")):
+        unfinished = any(part.startswith(".") for part in path.relative_to(folder).parts)  # of a killed conversion
+        if unfinished or not results.isdisjoint(path.parents):
+            continue
+        if path.suffix in (".toml", ".csv", ".npz", ".gz") and path.is_file():
+            digest.update(str(path.relative_to(folder)).encode() + b"\0")
+            with path.open("rb") as file:
+                while part := file.read(1 << 20):
+                    digest.update(part)
+    return digest.hexdigest()
+
+
+def spaced(t: np.ndarray, least: float) -> np.ndarray:
+    """Indices of times (T,), the first one and each that is at least so much later than the last one taken [s]."""
+    kept, latest = [], -np.inf
+    for i, now in enumerate(t):
+        if now >= latest + least:
+            kept.append(i)
+            latest = now
+    return np.array(kept, int)
 
 
 def held_from_middle(rates: Command) -> Command:

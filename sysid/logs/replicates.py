@@ -1,10 +1,7 @@
 """Drives that repeat one another: the same commands as functions of time, whenever the recording began.
 
-A dataset's commands repeat exactly. A bag's never do: it begins at another moment, and messages come early, late,
-never.
+A dataset's commands repeat exactly. A bag's never do: it begins at another moment, and messages come early or late.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,14 +10,13 @@ import numpy as np
 
 from sysid.logs.records import Command, Trial
 
-EXACT = 1e-6  # s, m/s, rad/s that equal tables may differ by
 NONE = 1e-3  # m/s or rad/s of a command below which nothing moves
 TABLE_DT = 0.01  # s, of the functions that are compared
 PERIODS = 1.5  # of the commands, by which a change may come earlier or later
 TIMING = (0.05, 0.2)  # s, bounds of that time
 VALUE = (2e-3, 0.005)  # m/s or rad/s, and share of the largest command, by which values may differ
 LONGEST = 3600.0  # s of drive that are compared
-EXACT = 1e-6  # s by which differences of times may be rounded
+EXACT = 1e-6  # s, m/s and rad/s of differences that are rounding
 ROUNDED = 0.02  # s that times of two tables may differ by, row by row, where they are compared row by row
 NEAR = 0.25
 """Distance of two commands (root mean square over a drive), as a share of the larger one, at which a model still leaves

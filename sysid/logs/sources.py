@@ -1,7 +1,5 @@
 """What a path holds, and which command takes it: for the messages of commands that were given something else."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -73,8 +71,9 @@ def _about_folder(path: Path) -> str:
 
 
 def _about_file(path: Path) -> str:
+    convert = f"Convert it first: python -m sysid.convert {in_shell(path)} --out DATASET"
     if is_bag(path):
-        return f"a ROS bag. Convert it first: python -m sysid.convert {in_shell(path)} --out DATASET"
+        return f"a ROS bag. {convert}"
     if path.suffix in PACKED:
         return f"a packed file. Unpack it{' (zstd -d)' if path.suffix in PACKED[:2] else ''}, then give what was in it."
     if path.name == "dataset.toml":
@@ -89,7 +88,7 @@ def _about_file(path: Path) -> str:
                 f"commands or wheel speeds, then: python -m sysid.convert {in_shell(path.parent)} --out DATASET")
     if path.suffix in (".csv", ".txt", ".tsv"):
         names = f" with the columns {', '.join(rows[0][:12])}" if rows and not _numbers(rows[0]) else ""
-        return f"a text file{names}. Convert it first: python -m sysid.convert {in_shell(path)} --out DATASET"
+        return f"a text file{names}. {convert}"
     if path.suffix in ROBOT_FILES:
         return (f"a robot file. Look at it with python -m sysid.inspect {in_shell(path)}, fit it to a dataset with "
                 f"python -m sysid.fit DATASET --model {in_shell(path)}")

@@ -4,22 +4,21 @@ Offsets come from shifting one signal against the other. Between command and mot
 response, is fitted with the shift; the rest is clock offset and transport delay, which no drive can separate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from sysid.logs.records import Command, OdometryStream, PoseStream, Trial
+from sysid.logs.planar import added_up, differenced, half_span
+from sysid.logs.records import Command, OdometryStream, PoseStream, Trial, logged_pose
 
 GRID_DT = 0.02  # s, of the signals that are compared
 SMOOTHING = 0.2  # s, over which positions are differenced
 LAGS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)  # s, first-order responses that are tried
 GAP = 2.5  # sampling periods without a sample
 MOVING = 0.05  # m/s or rad/s, above which a vehicle should not repeat its pose
-MIN_SIGNAL = {"v": 0.03, "omega": 0.03}  # m/s, rad/s of standard deviation below which a channel shows no shift
+MIN_SIGNAL = 0.03  # m/s, rad/s of standard deviation below which a channel shows no shift
 
 
 @dataclass(frozen=True)
@@ -32,9 +31,7 @@ class StreamQuality:
     longest: float  # longest interval [s]
     gaps: int  # intervals longer than GAP periods
     missing: float  # share of samples that the mean interval outside gaps promises and the stream lacks
-    held: float
-    """Share of samples that repeat the one before while the command moves: of the pose or of the speeds, whichever
-    repeats more; nan for commands."""
+    held: float  # largest share of samples, of pose or speeds, that repeat while the command moves; nan for commands
 
     @property
     def rate(self) -> float:
@@ -45,10 +42,9 @@ class StreamQuality:
 def quality(
     t: np.ndarray, values: Sequence[np.ndarray] = (), moving: np.ndarray | None = None
 ) -> StreamQuality:
-    """Sampling of a stream.
+    """Sampling of a stream at times (T,) [s].
 
     Args:
-        t: (T,) times [s], increasing.
         values: tables (T, C) whose repeated rows count, each for itself: a pose may be updated less often than speeds.
         moving: (T,) bool, where the vehicle should move: at rest it rightly repeats its pose.
     """
@@ -68,17 +64,12 @@ def quality(
 
 def trial_quality(trial: Trial) -> dict[str, StreamQuality]:
     """Sampling of each stream of a trial that has at least two samples."""
-    found = {}
-    if len(trial.command.t) > 1:
-        found["command"] = quality(trial.command.t)
-    if trial.gyro is not None and len(trial.gyro.t) > 1:
-        found["gyro"] = quality(trial.gyro.t)
+    found = {name: quality(stream.t) for name, stream in (("command", trial.command), ("gyro", trial.gyro))
+             if stream is not None and len(stream.t) > 1}
     for name, stream in (("odometry", trial.odometry), ("ground_truth", trial.ground_truth)):
         if stream is None or len(stream.t) < 2:
             continue
-        values = []
-        if stream.x is not None and stream.y is not None and stream.yaw is not None:
-            values.append(np.column_stack([stream.x, stream.y, stream.yaw]))
+        values = [] if (pose := logged_pose(stream)) is None else [pose.values]
         if isinstance(stream, OdometryStream):
             values.append(np.column_stack([stream.v, stream.omega]))
         found[name] = quality(stream.t, values, _commanded(trial, stream.t))
@@ -93,14 +84,14 @@ def without_held(trial: Trial) -> Trial:
     pose, odometry = trial.ground_truth, trial.odometry
     if pose is not None:
         trial = replace(trial, ground_truth=_new_rows(pose, _commanded(trial, pose.t)))
-    if odometry is not None and not any(one is None for one in (odometry.x, odometry.y, odometry.yaw)):
+    if odometry is not None and logged_pose(odometry) is not None:
         trial = replace(trial, odometry=_new_rows(odometry, _moving(odometry.v, odometry.omega)))
     return trial
 
 
 def _new_rows(stream: Any, moving: np.ndarray) -> Any:
     """The stream's rows that differ from the one before or are at rest; itself where all are, or hardly any is."""
-    columns = {one.name: getattr(stream, one.name) for one in fields(stream)}
+    columns = vars(stream)
     repeated = np.all([np.diff(column) == 0 for name, column in columns.items() if name != "t"], axis=0)
     kept = np.append(True, ~repeated | ~moving[1:])
     return stream if kept.all() or kept.sum() < 2 else type(stream)(**{
@@ -139,16 +130,12 @@ def find_shift(
         return None
     if np.std(reference[count:-count]) < 0.3 * np.std(reference):
         return None  # a step near an end moves out of sight with the shift
-    best: tuple[float, float, np.ndarray, int, np.ndarray] | None = None
     target = signal[count:-count]
-    for lag in lags:
-        slow = _first_order(reference, lag, dt)
-        scores = np.abs(_correlations(slow, target))[::-1]  # the earliest window is that of the latest signal
-        k = int(np.argmax(scores))
-        if best is None or scores[k] > best[0]:
-            best = (float(scores[k]), lag, scores, k, slow[2 * count - k : len(slow) - k])
-    assert best is not None
-    top, lag, scores, k, aligned = best
+    slow = [_first_order(reference, lag, dt) for lag in lags]
+    every = [np.abs(_correlations(one, target))[::-1] for one in slow]  # the earliest window is of the latest signal
+    best = int(np.argmax([scores.max() for scores in every]))
+    scores, k = every[best], int(np.argmax(every[best]))
+    top, aligned = float(scores[k]), slow[best][2 * count - k : len(reference) - k]
     if k in (0, 2 * count) or not np.isfinite(top):
         return None
     left, right = scores[k - 1], scores[k + 1]
@@ -156,7 +143,7 @@ def find_shift(
     fraction = 0.5 * (left - right) / bend if bend < 0 else 0.0
     centred = aligned - aligned.mean()
     gain = float(centred @ target / (centred @ centred))
-    return Shift(float((k - count + fraction) * dt), float(lag), float(np.copysign(top, gain)), gain)
+    return Shift(float((k - count + fraction) * dt), float(lags[best]), float(np.copysign(top, gain)), gain)
 
 
 def response_shift(trial: Trial, stream: str) -> dict[str, Shift]:
@@ -166,13 +153,10 @@ def response_shift(trial: Trial, stream: str) -> dict[str, Shift]:
         return {}
     pose = trial.ground_truth if stream == "ground_truth" else None
     when = rates[0] if pose is None else np.arange(pose.t[0], pose.t[-1] + GRID_DT, GRID_DT)
-    found = {}
-    for name, commanded, measured in zip(("v", "omega"), trial.command.at(when, (0.0, 0.0)), rates[1:], strict=True):
-        if pose is not None:
-            commanded = _as_seen(when, commanded, pose, rates[0])
-        if commanded.std() > MIN_SIGNAL[name] and (shift := find_shift(commanded, measured, lags=LAGS)) is not None:
-            found[name] = shift
-    return found
+    commanded = list(trial.command.at(when, (0.0, 0.0)))
+    if pose is not None:
+        commanded = [_as_seen(when, one, pose, rates[0]) for one in commanded]
+    return _shifts(commanded, rates[1:], lags=LAGS)
 
 
 def clock_shift(trial: Trial) -> dict[str, Shift]:
@@ -180,15 +164,18 @@ def clock_shift(trial: Trial) -> dict[str, Shift]:
     odometry, pose, theirs = trial.odometry, trial.ground_truth, speeds(trial, "ground_truth")
     if odometry is None or len(odometry.t) < 2 or pose is None or theirs is None:
         return {}
-    half = _half_span(pose)
+    half = half_span(pose.t)
     inside = (theirs[0] >= odometry.t[0] + half) & (theirs[0] <= odometry.t[-1] - half)
-    grid, found = theirs[0][inside], {}
-    for name, rate, signal in (("v", odometry.v, theirs[1]), ("omega", odometry.omega, theirs[2])):
-        reference = _as_seen(odometry.t, rate, pose, grid)
-        if (inside.sum() > 1 and reference.std() > MIN_SIGNAL[name]
-                and (shift := find_shift(reference, signal[inside], reach=0.6)) is not None):
-            found[name] = shift
-    return found
+    if inside.sum() < 2:
+        return {}
+    references = [_as_seen(odometry.t, rate, pose, theirs[0][inside]) for rate in (odometry.v, odometry.omega)]
+    return _shifts(references, [one[inside] for one in theirs[1:]], reach=0.6)
+
+
+def _shifts(references: Sequence[np.ndarray], signals: Sequence[np.ndarray], **how: Any) -> dict[str, Shift]:
+    """`find_shift` of each signal (T,), of "v" and of "omega", that has a reference (T,) with something to compare."""
+    return {name: shift for name, reference, signal in zip(("v", "omega"), references, signals, strict=True)
+            if reference.std() > MIN_SIGNAL and (shift := find_shift(reference, signal, **how)) is not None}
 
 
 def speeds(trial: Trial, stream: str, smooth: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -201,14 +188,13 @@ def speeds(trial: Trial, stream: str, smooth: bool = False) -> tuple[np.ndarray,
         return None
     if isinstance(source, PoseStream):
         return _pose_speeds(source)
-    grid = np.arange(source.t[0], source.t[-1], GRID_DT)
-    columns = [np.interp(grid, source.t, values) for values in (source.v, source.omega)]
-    if smooth:
-        half = SMOOTHING / 2
-        columns = [_mean_over(grid, column, half) for column in columns]
-        inside = (grid >= grid[0] + half) & (grid <= grid[-1] - half)
-        return grid[inside], columns[0][inside], columns[1][inside]
-    return grid, columns[0], columns[1]
+    grid, half = np.arange(source.t[0], source.t[-1], GRID_DT), SMOOTHING / 2
+    v, omega = (np.interp(grid, source.t, values) for values in (source.v, source.omega))
+    if not smooth:
+        return grid, v, omega
+    inside = grid[(grid >= grid[0] + half) & (grid <= grid[-1] - half)]
+    v, omega = (differenced(grid, added_up(grid, one, grid), inside, half) for one in (v, omega))
+    return inside, v, omega
 
 
 def pose_jitter(trial: Trial) -> float:
@@ -216,15 +202,15 @@ def pose_jitter(trial: Trial) -> float:
 
     A pose that is updated on one clock and sampled on another moves by uneven steps at a steady speed.
     """
-    odometry = trial.odometry
-    if odometry is None or odometry.x is None or odometry.y is None or len(odometry.t) < 20:
+    odometry, pose = trial.odometry, logged_pose(trial.odometry, 20)
+    if odometry is None or pose is None:
         return float("nan")
     dt = np.diff(odometry.t)
     speed = np.abs(odometry.v[1:] + odometry.v[:-1]) / 2
     steady = (speed > 0.2) & (np.abs(np.diff(odometry.v)) < 0.05 * speed) & (dt < GAP * np.median(dt))
     if steady.sum() < 20:
         return float("nan")
-    steps = np.hypot(np.diff(odometry.x), np.diff(odometry.y))[steady] / speed[steady]
+    steps = np.hypot(np.diff(pose.x), np.diff(pose.y))[steady] / speed[steady]
     return float(np.std(steps / np.mean(steps / dt[steady]) - dt[steady]) / np.sqrt(2))
 
 
@@ -237,34 +223,18 @@ def standstill(command: Command, end: float) -> tuple[float, float]:
     return float(max(command.t[moving[0]], 0.0)), float(max(end - after, 0.0))
 
 
-def _half_span(pose: PoseStream) -> float:
-    """Half of the time over which a pose is differenced [s]."""
-    return max(SMOOTHING / 2, float(np.median(np.diff(pose.t))))
-
-
 def _as_seen(when: np.ndarray, rate: np.ndarray, pose: PoseStream, grid: np.ndarray) -> np.ndarray:
     """A rate (T,) at times `when` (T,) as `_pose_speeds` would show it (G,) on its grid (G,): what it adds up to, known
     at the times of the pose alone. A pose that comes seldom shows everything smoother, and so it must be compared."""
-    way, half = added_up(when, rate, pose.t), _half_span(pose)
-    return np.asarray(np.interp(grid + half, pose.t, way) - np.interp(grid - half, pose.t, way)) / (2 * half)
+    return differenced(pose.t, added_up(when, rate, pose.t), grid, half_span(pose.t))
 
 
 def _pose_speeds(pose: PoseStream) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    half = _half_span(pose)
+    half = half_span(pose.t)
     grid = np.arange(pose.t[0] + half, pose.t[-1] - half, GRID_DT)
-
-    def at(t: np.ndarray, column: np.ndarray) -> np.ndarray:
-        return np.interp(t, pose.t, column)
-
-    dx, dy, turn = (at(grid + half, column) - at(grid - half, column) for column in (pose.x, pose.y, pose.yaw))
-    yaw = at(grid, pose.yaw)
-    return grid, (np.cos(yaw) * dx + np.sin(yaw) * dy) / (2 * half), turn / (2 * half)
-
-
-def _mean_over(t: np.ndarray, values: np.ndarray, half: float) -> np.ndarray:
-    """Mean of values over t - half to t + half, by the integral."""
-    integral = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(t))])
-    return (np.interp(t + half, t, integral) - np.interp(t - half, t, integral)) / (2 * half)
+    dx, dy, turn = (differenced(pose.t, column, grid, half) for column in (pose.x, pose.y, pose.yaw))
+    yaw = np.interp(grid, pose.t, pose.yaw)
+    return grid, np.cos(yaw) * dx + np.sin(yaw) * dy, turn
 
 
 def _correlations(values: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -289,9 +259,3 @@ def _first_order(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
     keep = np.exp(-dt / lag)
     response = lfilter([1 - keep], [1, -keep], values[:-1], zi=[keep * values[0]])[0]
     return np.concatenate([values[:1], response])
-
-
-def added_up(when: np.ndarray, rate: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """What a rate (T,) at times `when` (T,) [s] adds up to at times t (M,) from its first; before it was as then."""
-    added = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(when))])
-    return np.asarray(np.interp(t, when, added) + np.minimum(t - when[0], 0.0) * rate[0])

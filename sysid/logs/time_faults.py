@@ -1,13 +1,11 @@
 """Signs that the time of a log went wrong: rows in bursts, and a clock that was set forward in the drive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 
 from sysid.logs.command_timeout import command_timeout
-from sysid.logs.records import OdometryStream, Trial
+from sysid.logs.records import Trial, logged_pose
 
 BURST = 0.2  # of the mean interval, below which the median interval shows bursts
 PAUSE = (0.5, 5.0)  # s and mean intervals: the least gap that is looked at
@@ -19,11 +17,11 @@ CHANGED = 0.3  # of the usual range of a speed, in which it changes by itself at
 
 
 def time_faults(trials: Sequence[Trial]) -> list[str]:
-    """Sentences on streams in bursts and on times that jump ahead of the motion."""
+    """Sentences on streams in bursts, on commands that end too early, and on times of which nothing was recorded."""
     found = []
     for name in ("odometry", "ground_truth"):
         streams = [stream for trial in trials if (stream := getattr(trial, name)) is not None and len(stream.t) > 20]
-        bursts = [_usual_wait(one.t) for one in streams if _in_bursts(one.t)]
+        bursts = [wait for one in streams if (wait := _between_bursts(one.t))]
         if bursts and len(bursts) >= len(streams) / 2:
             found.append(f"{name}: its rows come in bursts, {max(bursts):.2g} s apart, while most follow one "
                          "another at once: t is a time of receipt. Use the times of measurement; sysid.convert takes "
@@ -33,7 +31,12 @@ def time_faults(trials: Sequence[Trial]) -> list[str]:
         found.append(f"command: in {len(cut)} of {len(trials)} trials ({name}) the commands end {rest:.1f} s before "
                      "the odometry, and the vehicle goes on to change its speed: the rest of them was not recorded. "
                      "Cut the trial where they end, or record all of them.")
-    return [*found, *outages(trials)]
+    if paused := [(trial.name, *outage) for trial in trials if (outage := _outage(trial)) is not None]:
+        name, begin, end = paused[0]
+        found.append(f"time: in {len(paused)} of {len(trials)} trials ({name}, from {begin:.1f} to {end:.1f} s) no "
+                     "stream has a row, commands neither, though they come regularly otherwise: the recording paused, "
+                     "and what was sent meanwhile is unknown. Split the trial there.")
+    return found
 
 
 def set_forward(trials: Sequence[Trial]) -> list[str]:
@@ -48,33 +51,19 @@ def set_forward(trials: Sequence[Trial]) -> list[str]:
             "the trial there, or take the jump out of all of its streams."]
 
 
-def outages(trials: Sequence[Trial]) -> list[str]:
-    """A sentence on drives that nothing was recorded of for a while, commands neither."""
-    found = [(trial.name, *outage) for trial in trials if (outage := _outage(trial)) is not None]
-    if not found:
-        return []
-    name, begin, end = found[0]
-    return [f"time: in {len(found)} of {len(trials)} trials ({name}, from {begin:.1f} to {end:.1f} s) no stream has a "
-            "row, commands neither, though they come regularly otherwise: the recording paused, and what was sent "
-            "meanwhile is unknown. Split the trial there."]
-
-
 def _outage(trial: Trial) -> tuple[float, float] | None:
     """Begin and end [s] of the longest time for which all streams pause that come regularly; None without one."""
     streams = [one.t for one in (trial.command, trial.odometry, trial.ground_truth) if one is not None]
-    if len(streams) < 2 or any(len(t) < 20 or _uneven(t) for t in streams):
+    if len(streams) < 2 or min(map(len, streams)) < 20:
         return None
+    for steps in map(np.diff, streams):  # as commands that are sent where they change
+        if np.mean(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) > UNEVEN:
+            return None
     rows = np.sort(np.concatenate(streams))
     k = int(np.argmax(np.diff(rows)))
     begin, end = float(rows[k]), float(rows[k + 1])
     longest = max(float(np.median(np.diff(t))) for t in streams)
     return (begin, end) if end - begin > max(PAUSE[0], PAUSE[1] * longest) else None
-
-
-def _uneven(t: np.ndarray) -> bool:
-    """Whether most rows do not come at one rate, as commands that are sent where they change."""
-    steps = np.diff(t)
-    return bool(np.mean(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) > UNEVEN)
 
 
 def pauses(trials: Sequence[Trial]) -> list[str]:
@@ -108,16 +97,14 @@ def forward_jump(trial: Trial) -> tuple[float, float] | None:
 
     Rows that are only lost leave a gap too, but the vehicle drives on in it.
     """
-    stream = trial.odometry
-    if not isinstance(stream, OdometryStream) or stream.x is None or stream.y is None or stream.yaw is None:
+    stream, pose = trial.odometry, logged_pose(trial.odometry, 21)
+    if stream is None or pose is None:
         return None
     gaps = np.diff(stream.t)
-    if len(gaps) < 20:
-        return None
     expected = np.stack([np.minimum(np.abs(one[1:]), np.abs(one[:-1])) * gaps for one in (stream.v, stream.omega)])
     after = np.minimum(np.arange(len(gaps)) + 3, len(gaps))  # rows that were held up catch up in the next ones
-    moved = np.stack([np.hypot(stream.x[after] - stream.x[:-1], stream.y[after] - stream.y[:-1]),
-                      np.abs(stream.yaw[after] - stream.yaw[:-1])])
+    x, y, turn = (one[after] - one[:-1] for one in pose.values.T)
+    moved = np.stack([np.hypot(x, y), np.abs(turn)])
     long = gaps > max(PAUSE[0], PAUSE[1] * float(gaps.mean()))
     still = (expected > LEAST).any(axis=0) & ((moved < MOVED * expected) | (expected <= LEAST)).all(axis=0)
     other, command = trial.ground_truth, trial.command
@@ -135,12 +122,8 @@ def forward_jump(trial: Trial) -> tuple[float, float] | None:
     return None
 
 
-def _in_bursts(t: np.ndarray) -> bool:
-    steps = np.diff(t)
-    return bool(np.median(steps) < BURST * steps.mean() and _usual_wait(t) > 2 * steps.mean())
-
-
-def _usual_wait(t: np.ndarray) -> float:
-    """The interval between rows (T,) that half of the time is spent in longer ones [s]."""
+def _between_bursts(t: np.ndarray) -> float:
+    """Interval between rows (T,) that half of the time is spent in longer ones [s]; 0 where they come in no bursts."""
     steps = np.sort(np.diff(t))
-    return float(steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)])
+    wait = float(steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)])
+    return wait if np.median(steps) < BURST * steps.mean() and wait > 2 * steps.mean() else 0.0

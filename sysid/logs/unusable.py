@@ -6,8 +6,6 @@ it is and with whatever factor a gyro may have. A vehicle stands though commande
 emergency stop was pressed, its motors were off or its wheels blocked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -20,16 +18,17 @@ LOST = 0.5  # yaw [rad] by which the outside pose may part from the rate: at 3 m
 LATEST, STEP = 1.2, 0.05  # s, delays of the outside pose that are tried
 FACTOR = 0.15  # by which the rate's scale may be off
 LEAST = 8  # training trials that must be left for lost ones to be left out
+STANDS = 0.1  # share of the commanded speeds (root mean square) below which a vehicle stands: what is left is noise
+RESPONSE = 0.3  # s, of a usual vehicle
+STILL = 0.01  # m/s of commands that ask for nothing
+FOLLOWS = 0.5  # share of a commanded speed at which a vehicle moves
+SLOWEST = 0.1  # quantile of the commands at which it does, below which its dead zone may lie
 
 
 def yaw_contradiction(trial: Trial, rate: tuple[np.ndarray, np.ndarray]) -> float:
     """Largest difference [rad] between the outside yaw and the integral of a yaw rate, at the delay where it is least.
 
-    Args:
-        rate: times (T,) [s] and yaw rates of the body (T,) [rad/s]. Before its first time the vehicle turned as then.
-
-    Returns:
-        nan where the trial has no outside pose.
+    `rate`: times (T,) [s] and yaw rates of the body (T,) [rad/s]; nan where the trial has no outside pose.
     """
     pose, (when, turning) = trial.ground_truth, rate
     if pose is None or len(pose.t) == 0 or len(when) < 2:
@@ -68,13 +67,6 @@ def without_lost(log: Log) -> Log:
                                                "are left"))
     kept = log.select(lambda trial: trial.held_out or trial.name not in gone)
     return replace(kept, notes=(*log.notes, f"{contradicted}, and they are not fitted"))
-
-
-STANDS = 0.1  # share of the commanded speeds (root mean square) below which a vehicle stands: what is left is noise
-RESPONSE = 0.3  # s, of a usual vehicle
-STILL = 0.01  # m/s of commands that ask for nothing
-FOLLOWS = 0.5  # share of a commanded speed at which a vehicle moves
-SLOWEST = 0.1  # quantile of the commands at which it does, below which its dead zone may lie
 
 
 def stood(trials: Sequence[Trial], reach: float) -> list[str]:

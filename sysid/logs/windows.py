@@ -3,15 +3,13 @@
 Over minutes an open-loop replay drifts by more than any parameter moves it, and a single drive shows no noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from sysid.logs.records import Command, Log, OdometryStream, Start, Trial
+from sysid.logs.records import Command, Log, Start, Trial, logged_pose
 from sysid.logs.replicates import same_course
 
 WINDOW = 20.0
@@ -33,18 +31,13 @@ def in_windows(log: Log) -> Log:
         if trial.duration < LONG or trial.name in again:
             trials.append(trial)
             continue
-        length = length_of(trial)
-        every = [_window(trial, k, length) for k in range(round(trial.duration / length))]
-        parts = [one for one in every if one is not None]
+        length = trial.duration / np.ceil(trial.duration / WINDOW - TINY)  # equal ones, so that no end is lost
+        count = round(trial.duration / length)
+        parts = [one for k in range(count) if (one := _window(trial, k, length)) is not None]
         trials += parts
         notes.append(f"{trial.name} lasts {trial.duration:.0f} s: it is taken as {len(parts)} windows of "
                      f"{length:.3g} s, each from where it was measured to be")
     return replace(log, trials=tuple(trials), notes=tuple(notes))
-
-
-def length_of(trial: Trial) -> float:
-    """Length of a trial's windows [s]: it is cut into equal ones, so that nothing of its end is lost."""
-    return trial.duration / np.ceil(trial.duration / WINDOW - TINY)
 
 
 def _window(trial: Trial, number: int, length: float) -> Trial | None:
@@ -60,7 +53,9 @@ def _window(trial: Trial, number: int, length: float) -> Trial | None:
     start, odometry = trial.start, trial.odometry
     if number:
         start = _start(trial, begin)
-        odometry = None if odometry is None else _rebased(odometry, begin)
+        if (pose := logged_pose(odometry)) is not None and odometry is not None:  # counted from where it was then
+            odometry = replace(odometry, **vars(pose.seen_from(*(float(np.interp(begin, pose.t, one))
+                                                                 for one in pose.values.T))))
     streams = [None if one is None else _between(one, begin, end) for one in (path, odometry, trial.gyro)]
     if not any(one is not None and len(one.t) > 1 for one in streams[:2]):
         return None
@@ -107,16 +102,6 @@ def _line(t: np.ndarray, values: np.ndarray) -> tuple[Sequence[float], Sequence[
     left = np.square(values[near] - design @ found).sum(axis=0) / (near.sum() - 2)
     error = np.sqrt(left * np.linalg.pinv(design.T @ design)[0, 0])
     return found[0].tolist(), found[1].tolist(), (float(np.sqrt(np.mean(error[:2] ** 2))), float(error[-1]))
-
-
-def _rebased(odometry: OdometryStream, begin: float) -> OdometryStream:
-    """The odometry counted from where it was at a time [s]."""
-    if odometry.x is None or odometry.y is None or odometry.yaw is None:
-        return odometry
-    x0, y0, yaw0 = (float(np.interp(begin, odometry.t, one)) for one in (odometry.x, odometry.y, odometry.yaw))
-    cos, sin = np.cos(yaw0), np.sin(yaw0)
-    x, y = odometry.x - x0, odometry.y - y0
-    return replace(odometry, x=cos * x + sin * y, y=-sin * x + cos * y, yaw=odometry.yaw - yaw0)
 
 
 def _between(stream: Any, begin: float, end: float) -> Any:

@@ -4,8 +4,6 @@ A clock may be set in the middle of a recording, and messages may come in bursts
 their times, so a clock that was set back shows only against the header stamps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,14 +30,10 @@ class Step:
 
 
 def stream_times(bag: Bag, stamp: str) -> dict[str, np.ndarray]:
-    """Times [s] of each stream's messages.
+    """Times [s] of each stream's messages; ValueError where a stream has no stamps, or they run back.
 
-    Args:
-        stamp: "receive" (all on the recorder's clock) or "header" (when measured; commands, which have no header, keep
-            the time of receipt, so both clocks must agree).
-
-    Raises:
-        ValueError: a stream has no stamps, or they run back.
+    `stamp`: "receive" (all on the recorder's clock) or "header" (when measured; commands, which have no header, keep
+    the time of receipt, so both clocks must agree).
     """
     times = {}
     for name, stream in bag.streams.items():
@@ -84,11 +78,8 @@ def in_order(bag: Bag, stamp: str) -> Bag:
 
 
 def clock_notes(bag: Bag, stamp: str) -> list[str]:
-    """Notes on clocks that disagree without harm to the times that are used.
-
-    Raises:
-        ValueError: a clock that is used was set in the middle of the recording.
-    """
+    """Notes on clocks that disagree without harm to the times that are used; ValueError where one that is used was set
+    in the middle of the recording."""
     notes = []
     all_stamped = all(_has_stamps(stream) for stream in bag.streams.values())
     for name, stream in bag.streams.items():

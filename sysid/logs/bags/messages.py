@@ -1,9 +1,6 @@
 """The numbers of one message."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,17 +9,9 @@ from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS
 from sysid.logs.bags.wheel_states import chair_row, joint_row
 from sysid.logs.planar import yaw_of
 
-POSE: dict[str, Callable[[Any], Any]] = {
-    "Odometry": lambda message: message.pose.pose, "PoseStamped": lambda message: message.pose,
-    "PoseWithCovarianceStamped": lambda message: message.pose.pose,
-    "TransformStamped": lambda message: message.transform,
-}
-"""Type -> the pose in its message."""
-
 
 def read_message(stream: str, kind: str, message: Any) -> tuple[float, ...]:
-    """Columns of one message: v, omega; x, y, yaw, v, omega; or x, y, yaw; all of them nan where a number is not
-    finite, and infinite where the orientation was never set."""
+    """`COLUMNS` of one message: all nan where a number is not finite, and inf where the orientation was never set."""
     row = _columns(stream, kind, message)
     whole = all(map(math.isfinite, row)) or all(map(math.isinf, row)) or kind == "JointState"
     return row if whole else (math.nan,) * len(row)
@@ -35,12 +24,10 @@ def _columns(stream: str, kind: str, message: Any) -> tuple[float, ...]:
         return (float(message.angular_velocity.z),)
     if kind == "JointState":
         return joint_row(message)
-    if kind == "Odometry" and stream == "command":
-        return float(message.twist.twist.linear.x), float(message.twist.twist.angular.z)
     if stream == "command":
-        twist = message.twist if kind == "TwistStamped" else message
+        twist = _inner(message, "twist")
         return float(twist.linear.x), float(twist.angular.z)
-    pose = POSE[kind](message)
+    pose = message.transform if kind == "TransformStamped" else _inner(message, "pose")
     position = getattr(pose, "position", None) or pose.translation
     q = getattr(pose, "orientation", None) or pose.rotation
     if abs(q.w) + abs(q.x) + abs(q.y) + abs(q.z) < 1e-6:
@@ -48,8 +35,15 @@ def _columns(stream: str, kind: str, message: Any) -> tuple[float, ...]:
     planar = float(position.x), float(position.y), float(yaw_of(q.w, q.x, q.y, q.z))
     if stream == "ground_truth":
         return planar
-    speed = message.twist.twist
+    speed = _inner(message, "twist")
     return *planar, float(speed.linear.x), float(speed.angular.z)
+
+
+def _inner(message: Any, name: str) -> Any:
+    """The twist or the pose in a message, which may have a header or covariances around it."""
+    while hasattr(message, name):
+        message = getattr(message, name)
+    return message
 
 
 def header_time(message: Any) -> float:

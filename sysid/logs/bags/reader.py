@@ -6,10 +6,8 @@ PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and
 no pose, the transforms between frames (TFMessage) are chained to one.
 """
 
-from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.bags.frames import frame_streams, unposed
+from sysid.logs.bags import transforms
 from sysid.logs.bags.messages import header_time, read_message, sideways_speed, without_stamp
 from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS, OPTIONS, PACKED, SUFFIXES, Bag, BagStream, short_type
-from sysid.logs.bags.topics import choose_topics, framed, no_pose, not_read
+from sysid.logs.bags.topics import choose_topics, framed, namespaces, no_pose, not_read
 from sysid.logs.bags.wheel_states import (
     CHAIR_DEFINITION,
     COARSE,
@@ -42,16 +40,12 @@ def read_bag(
     path: Path, topics: dict[str, str] | None = None, geometry: tuple[float, float] = (0.1325, 0.496),
     wheels: bool = False,
 ) -> Bag:
-    """Streams of a recording.
+    """Streams of a recording: the folder of a rosbag2, or a .db3, .mcap or .bag file.
 
     Args:
-        path: folder of a rosbag2, or a .db3, .mcap or .bag file.
         topics: "command", "odometry", "ground_truth", "imu" -> topic; those left out are looked for, "" leaves one out.
         geometry: nominal wheel radius and track [m], for angles and rates of wheels.
         wheels: take measured wheel speeds in place of the commands.
-
-    Raises:
-        ValueError: naming the file, the topic, the rule and the remedy.
     """
     if path.suffix in PACKED:
         with TemporaryDirectory() as folder:
@@ -60,12 +54,9 @@ def read_bag(
                 return replace(read_bag(unpacked, topics, geometry, wheels), path=path)
             except ValueError as error:
                 raise ValueError(str(error).replace(str(unpacked), str(path))) from None
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise ValueError(f"{path}: reading ROS bags needs the package rosbags ({error}). "
-                         "Run `pip install rosbags`.") from None
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
     notes: list[str] = []
     try:
         store = get_typestore(Stores.ROS2_HUMBLE)
@@ -75,7 +66,10 @@ def read_bag(
             asked = topics or {}
             chosen = choose_topics(path, known, {**asked, **dict.fromkeys(framed(known, asked), "")}, notes, wheels)
             rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
-            streams = frame_streams(path, reader, known, asked, unposed(chosen, asked, wheels), notes)
+            unposed = [] if {"odometry", "ground_truth"} & set(chosen) else [
+                stream for stream in ("odometry", "ground_truth")
+                if asked.get(stream) != "" and not (wheels and stream == "odometry")]
+            streams = _of_frames(path, reader, known, asked, unposed, notes)
             if not {"odometry", "ground_truth"} & {*chosen, *streams}:
                 raise no_pose(path, known, asked)
             notes += [] if "ground_truth" in {*chosen, *streams} else not_read(known, "odometry" in chosen)
@@ -93,7 +87,8 @@ def read_bag(
             streams[stream] = found if kept.shape[1] - 2 == len(COLUMNS[stream]) else _of_wheels(
                 stream, found, geometry, notes)
         elif stream not in spare:
-            raise _too_few(path, topic, len(kept), stream)
+            raise ValueError(f"{path}: topic {topic} has {len(kept)} usable messages; at least 2 are needed. Name "
+                             f"another topic with {OPTIONS[stream]}, or '' to go without.")
         elif len(kept):
             notes.append(f"{topic}: {len(kept)} usable messages; it is left out")
     return Bag(path, streams, notes)
@@ -120,33 +115,72 @@ def _opened(reader: Any, path: Path, store: Any, notes: list[str]) -> Iterator[A
 
 
 def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, list[tuple[float, ...]]]:
-    """Time of receipt and of the header [s] and columns of every message, by stream; damaged messages are left out.
-
-    Args:
-        names: topic -> stream.
-    """
+    """Time of receipt and of the header [s] and columns of every message by stream; `names`: topic -> stream."""
     rows: dict[str, list[tuple[float, ...]]] = {stream: [] for stream in names.values()}
-    broken: Counter[str] = Counter()
     sideways = 0.0
-    said = ""
-    for connection, received, raw in reader.messages(connections=[one for one in reader.connections
-                                                                  if one.topic in names]):
-        stream = names[connection.topic]
-        try:
-            message: Any = reader.deserialize(raw, connection.msgtype)
-            sideways = max(sideways, sideways_speed(message) if stream == "command" else 0.0)
-            rows[stream].append((received * 1e-9, header_time(message), *read_message(
-                stream, short_type(connection.msgtype), message)))
-        except Exception as error:  # the library lets out whatever a damaged message leads to
-            broken[connection.topic] += 1
-            said = said or str(error)
+
+    def take(topic: str, kind: str, received: float, message: Any) -> None:
+        nonlocal sideways
+        if (stream := names[topic]) == "command":
+            sideways = max(sideways, sideways_speed(message))
+        rows[stream].append((received, header_time(message), *read_message(stream, kind, message)))
+
+    broken, said = _each_message(reader, names, take)
     if broken and not any(rows.values()):
         raise ValueError(said)
     if sideways > SIDEWAYS:
         notes.append(f"commands also ask for up to {sideways:.2g} m/s sideways (linear.y): forward speed and yaw rate "
                      "alone are read, and no model drives sideways. Leave such drives out")
-    notes += [f"{topic}: {count} damaged messages are left out" for topic, count in broken.items()]
+    notes += broken
     return rows
+
+
+def _each_message(
+    reader: Any, topics: Container[str], take: Callable[[str, str, float, Any], None]
+) -> tuple[list[str], str]:
+    """Give topic, type, time of receipt [s] and content of each message to `take`; a note on each topic with damaged
+    ones, which are left out, and what was wrong with the first."""
+    broken, said = Counter[str](), ""
+    for connection, received, raw in reader.messages(connections=[one for one in reader.connections
+                                                                  if one.topic in topics]):
+        try:
+            message = reader.deserialize(raw, connection.msgtype)
+            take(connection.topic, short_type(connection.msgtype), received * 1e-9, message)
+        except Exception as error:  # the library lets out whatever a damaged message leads to
+            broken[connection.topic] += 1
+            said = said or str(error)
+    return [f"{topic}: {count} damaged messages are left out" for topic, count in broken.items()], said
+
+
+def _of_frames(
+    path: Path, reader: Any, known: Mapping[str, str], asked: Mapping[str, str], wanted: list[str], notes: list[str]
+) -> dict[str, BagStream]:
+    """Streams out of transforms: those that were named, or the one that there is of those that are wanted."""
+    named, trees = framed(known, asked), namespaces(known)
+    if named:
+        trees = [one for one in trees if any(topic in one for topic, _ in named.values())]
+    if not trees or not named and not wanted:
+        return {}
+    links = {one: transforms.Links(one) for one in trees}
+
+    def take(topic: str, kind: str, received: float, message: Any) -> None:
+        for one in trees:
+            if topic in one:
+                links[one].add(received, message)
+
+    topics = {topic for one in trees for topic in one}
+    notes += _each_message(reader, topics, take)[0]
+    try:
+        found = transforms.chosen_poses(list(links.values()), named, wanted, notes)
+    except transforms.NoChain as error:
+        option = OPTIONS[next(iter(named), wanted[0] if wanted else "ground_truth")]
+        topic = next((topic for topic, _ in named.values()), trees[0][0])
+        said = (f"{', '.join(sorted(topics))}: {error}. Name the frames, {option} {topic}:PARENT:CHILD; or record the "
+                "pose as Odometry or PoseStamped.")
+        raise ValueError(f"{path}: {said}") if named else no_pose(path, known, asked, said) from None
+    return {stream: BagStream(f"{one.topic}:{one.parent}:{one.child}", known[one.topic], one.received, one.stamped,
+                              one.with_speeds() if stream == "odometry" else one.pose)
+            for stream, one in found.items()}
 
 
 def _usable(
@@ -178,11 +212,6 @@ def _usable(
         (finite & far, "whose time is more than a day from the others'"),
         (finite & ~far & blank, "with a header stamp of zero, though the others have one,")) if which.any()]
     return table[finite & ~far & ~blank]
-
-
-def _too_few(path: Path, topic: str, count: int, stream: str) -> ValueError:
-    return ValueError(f"{path}: topic {topic} has {count} usable messages; at least 2 are needed. Name another topic "
-                      f"with {OPTIONS[stream]}, or '' to go without.")
 
 
 def _of_wheels(stream: str, found: BagStream, geometry: tuple[float, float], notes: list[str]) -> BagStream:

@@ -1,7 +1,5 @@
 """One recording: where it is, its streams, and the topics and types that hold them."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,8 +37,7 @@ class BagStream:
     """One topic of a bag."""
 
     topic: str
-    kind: str
-    """Message type, like "nav_msgs/msg/Odometry"."""
+    kind: str  # message type, like "nav_msgs/msg/Odometry"
     received: np.ndarray  # (T,) s, Unix time at which the recorder got the message
     stamped: np.ndarray  # (T,) s, of the header; nan where the type has none
     values: np.ndarray  # (T, C) columns of COLUMNS

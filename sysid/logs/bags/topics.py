@@ -1,7 +1,5 @@
 """Which topic is which stream: by name, by type, or as the caller says."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,8 +7,7 @@ from sysid.logs.bags import transforms
 from sysid.logs.bags.recording import CHAIR_STATE, OPTIONS, TOPICS, TRUTH, TYPES, from_outside, short_type
 
 WHAT = {"command": "commands that reached the vehicle", "odometry": "vehicle's odometry"}
-NOT_READ = {"AckermannDriveStamped": "which steers as cars do, and is not read",
-            "AckermannDrive": "which steers as cars do, and is not read",
+NOT_READ = {**dict.fromkeys(("AckermannDriveStamped", "AckermannDrive"), "which steers as cars do, and is not read"),
             "Path": "which is not read: record its poses as PoseStamped"}
 """Types that hold a motion, and why none is taken from them."""
 WHEELS = ("JointState", CHAIR_STATE, "Odometry")
@@ -51,11 +48,7 @@ def listed(known: Mapping[str, str]) -> str:
 
 
 def not_read(known: Mapping[str, str], frames: bool = False) -> list[str]:
-    """Notes on topics that hold a motion which is not read.
-
-    Args:
-        frames: transforms are none of the streams, though they might be the outside pose.
-    """
+    """Notes on topics that hold a motion which is not read; `frames`: neither are transforms, though they might be."""
     kinds = {short_type(kind): topic for topic, kind in known.items()}
     held = [topics[0] for topics in namespaces(known) if frames]
     return [*(f"{kinds[kind]} is {kind}, {why}" for kind, why in NOT_READ.items() if kind in kinds),
@@ -66,18 +59,14 @@ def not_read(known: Mapping[str, str], frames: bool = False) -> list[str]:
 def choose_topics(
     path: Path, known: dict[str, str], asked: dict[str, str], notes: list[str], wheels: bool = False
 ) -> dict[str, str]:
-    """Topic of each stream, from what the bag has, what was asked for, and the names that are usual.
-
-    Args:
-        wheels: the input is measured wheel speeds.
-    """
-    listing = listed(known)
+    """Topic of each stream, from what the bag has, what was asked for, and the names that are usual; `wheels`: the
+    input is measured wheel speeds."""
     chosen: dict[str, str] = {}
     types = {**TYPES, "command": WHEELS} if wheels else TYPES
     truths = _truths(known, asked)
     for stream in TOPICS:
         if wheels and stream == "command" and stream not in asked:
-            chosen.update(_wheel_topic(path, known, listing))
+            chosen[stream] = _wheel_topic(path, known)
             continue
         if wheels and stream == "odometry":
             continue
@@ -113,9 +102,9 @@ def choose_topics(
             notes.append(f"no odometry is taken: {said}")
     if "command" not in chosen and "command" not in asked:
         more = "".join(f" {one}." for one in not_read(known))
-        raise ValueError(f"{path}: no command topic found (topics with messages: {listing}).{more} Name the Twist or "
-                         "TwistStamped that was sent to the vehicle with --command-topic; or take the measured wheel "
-                         "speeds in its place, with an outside pose: --input wheels.")
+        raise ValueError(f"{path}: no command topic found (topics with messages: {listed(known)}).{more} Name the "
+                         "Twist or TwistStamped that was sent to the vehicle with --command-topic; or take the "
+                         "measured wheel speeds in its place, with an outside pose: --input wheels.")
     if "command" not in chosen:
         raise ValueError(f"{path}: --command-topic is empty; a trial needs its commands. Name their topic.")
     return chosen
@@ -144,13 +133,12 @@ def _truths(known: Mapping[str, str], asked: Mapping[str, str]) -> list[str]:
     return [name for name in TOPICS["ground_truth"] if name in found][:1] or found
 
 
-def _wheel_topic(path: Path, known: dict[str, str], listing: str) -> dict[str, str]:
+def _wheel_topic(path: Path, known: dict[str, str]) -> str:
     """The topic whose wheel speeds are the input."""
     for kind in WHEELS:
-        fitting = [name for name, one in known.items()
-                   if short_type(one) == kind and not from_outside(name)]
+        fitting = [name for name, one in known.items() if short_type(one) == kind and not from_outside(name)]
         usual = [name for name in TOPICS["odometry"] if name in fitting]
         if len(fitting) == 1 or usual:
-            return {"command": (usual or fitting)[0]}
-    raise ValueError(f"{path}: no topic with wheel speeds found (topics with messages: {listing}). Name a JointState "
-                     "or an Odometry with --command-topic.")
+            return (usual or fitting)[0]
+    raise ValueError(f"{path}: no topic with wheel speeds found (topics with messages: {listed(known)}). Name a "
+                     "JointState or an Odometry with --command-topic.")

@@ -4,8 +4,6 @@ A pose in `odom` is odometry. One in `map`, `world` or another fixed frame is an
 against their direction, as where a lidar odometry publishes `odom` as a child of the base.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +11,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sysid.logs.bags.messages import without_stamp
 from sysid.logs.planar import DIFFERENCED, pose_speeds, yaw_of
@@ -36,11 +35,9 @@ class NoChain(ValueError):
 class Links:
     """The transforms of one namespace: (parent, child) -> rows of receipt, stamp [s], x, y, z [m], qx, qy, qz, qw."""
 
-    topics: tuple[str, ...] = ("/tf", "/tf_static")
-    """Topics that they come from; options name the first."""
+    topics: tuple[str, ...] = ("/tf", "/tf_static")  # that they come from; options name the first
     rows: dict[tuple[str, str], list[tuple[float, ...]]] = field(default_factory=dict)
-    unset: int = 0
-    """Transforms that are left out, whose numbers are not finite or whose quaternion is zero."""
+    unset: int = 0  # transforms that are left out: their numbers are not finite, or their quaternion is zero
 
     def add(self, received: float, message: Any) -> None:
         """Take the transforms of a message."""
@@ -68,8 +65,7 @@ class Links:
 class Chained:
     """Pose of one frame in another."""
 
-    topic: str
-    """The topic of its transforms."""
+    topic: str  # of its transforms
     parent: str
     child: str
     received: np.ndarray  # (T,) s
@@ -87,11 +83,7 @@ class Chained:
 
 
 def base_frame(links: Links) -> str:
-    """The frame that moves with the vehicle.
-
-    Raises:
-        NoChain: there is none, or several have its name.
-    """
+    """The frame that moves with the vehicle; NoChain where there is none, or several have its name."""
     for name in BASES:
         found = [frame for frame in links.frames() if _last(frame) == name]
         if len(found) > 1:
@@ -123,8 +115,7 @@ def outside_frame(links: Links, base: str) -> str | None:
     return roots[0] if roots and any(_moves(links.rows[key]) for key, _ in chain(links, roots[0], base) or ()) else None
 
 
-FRAME_OF = {"odometry": odometry_frame, "ground_truth": outside_frame}
-"""Stream -> the frame in which its poses are."""
+FRAME_OF = {"odometry": odometry_frame, "ground_truth": outside_frame}  # stream -> the frame in which its poses are
 USUAL = {"odometry": "odom", "ground_truth": "map or world"}
 
 
@@ -151,15 +142,16 @@ def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
     """The pose of a frame in another, each time that the link which moves most often was sent.
 
     Other moving links are interpolated to these times, as tf2 does. Before one of them was first sent there is no pose.
-    After its last row a link is held; a note says so where that is long.
-
-    Raises:
-        NoChain: no links connect them, none of these moves, or they share no time.
+    After its last row a link is held; a note says so where that is long. NoChain where there is no such pose.
     """
     found = chain(links, parent, child)
     if found is None:
         raise NoChain(f"no links lead from {shown(parent)} to {shown(child)} (frames: {links})")
-    tables = {key: _sorted(np.array(links.rows[key])) for key, _ in found}
+    tables = {}
+    for key, _ in found:  # by their stamps where these are set, else by receipt; single rows without one are left out
+        table = np.array(links.rows[key])
+        table = table[~without_stamp(table[:, 1])]
+        tables[key] = table[np.argsort(table[:, 1 if (table[:, 1] > 0).all() else 0], kind="stable")]
     moving = [key for key, _ in found if len(tables[key]) > 1 and _moves(links.rows[key])]
     clock = tables[max(moving or tables, key=lambda key: len(tables[key]))]
     if len(clock) < 2:
@@ -178,15 +170,15 @@ def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
         if held > max(HELD[0], HELD[1] * float(np.median(np.diff(times[key])))):
             notes.append(f"{links.topics[0]}: {_arrow(key)} was last sent {held:.1f} s before the end and is held from "
                          "there on. Cut the recording there if it should have moved")
-    place, turn = np.zeros((kept.sum(), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (kept.sum(), 1))
+    place, turn = np.zeros((kept.sum(), 3)), Rotation.identity(int(kept.sum()))
     for key, along in found:
         rows = slice(None) if key in moving else slice(1)
         moved, turned = _at(times[key][rows], tables[key][rows, 2:], t[kept])
         if not along:
-            turned = turned * [-1.0, -1.0, -1.0, 1.0]
-            moved = -_rotated(turned, moved)
-        place, turn = place + _rotated(turn, moved), _product(turn, turned)
-    x, y, z, w = turn.T
+            turned = turned.inv()
+            moved = -turned.apply(moved)
+        place, turn = place + turn.apply(moved), turn * turned
+    x, y, z, w = turn.as_quat().T
     return Chained(links.topics[0], parent, child, clock[kept, 0], clock[kept, 1],
                    np.column_stack([place[:, :2], yaw_of(w, x, y, z)]))
 
@@ -194,16 +186,13 @@ def pose_of(links: Links, parent: str, child: str, notes: list[str]) -> Chained:
 def chosen_poses(
     trees: Sequence[Links], asked: Mapping[str, tuple[str, str]], wanted: Iterable[str], notes: list[str]
 ) -> dict[str, Chained]:
-    """The poses that stand for streams.
+    """The poses that stand for streams; NoChain, which names the frames, where there is none.
 
     Args:
         trees: the links of each namespace; robots in namespaces may give the same names to their frames.
         asked: stream -> topic, and "" or "PARENT:CHILD", as the caller named them.
         wanted: further streams, of which the one that there is may be taken.
         notes: what was chosen is added.
-
-    Raises:
-        NoChain: naming the frames.
     """
     if unset := sum(links.unset for links in trees):
         notes.append(f"{unset} transforms whose numbers are not finite, or with an orientation that is all zero, "
@@ -275,30 +264,10 @@ def _moves(rows: Sequence[tuple[float, ...]]) -> bool:
     return bool(len(rows) > 1 and np.ptp(np.array(rows)[:, 2:], axis=0).max() > STANDING)
 
 
-def _sorted(table: np.ndarray) -> np.ndarray:
-    """Rows in order of their stamps where these are set, else of receipt; single ones without a stamp are left out."""
-    table = table[~without_stamp(table[:, 1])]
-    return table[np.argsort(table[:, 1] if (table[:, 1] > 0).all() else table[:, 0], kind="stable")]
-
-
-def _at(when: np.ndarray, moved: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Translation (T, 3) and quaternion (T, 4) of a link at times t (T,), between its rows; at its end it stays."""
+def _at(when: np.ndarray, moved: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """Translation (T, 3) and turn of a link at times t (T,), between its rows; at its end it stays."""
     turns = moved[:, 3:] / np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
     flips = np.cumprod(np.append(1.0, np.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0)))
     turns = turns * flips[:, None]  # of the two quaternions of a turn the one near the last
     columns = np.stack([np.interp(t, when, one) for one in (*moved[:, :3].T, *turns.T)], axis=1)
-    turned = columns[:, 3:]
-    return columns[:, :3], turned / np.linalg.norm(turned, axis=1, keepdims=True)
-
-
-def _rotated(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors (T, 3) turned by quaternions (T, 4)."""
-    axis, w = turn[:, :3], turn[:, 3:]
-    cross = 2 * np.cross(axis, vector)
-    return np.asarray(vector + w * cross + np.cross(axis, cross))
-
-
-def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Products (T, 4) of quaternions (T, 4)."""
-    a, b, w, v = one[:, :3], other[:, :3], one[:, 3:], other[:, 3:]
-    return np.column_stack([w * b + v * a + np.cross(a, b), w * v - (a * b).sum(1, keepdims=True)])
+    return columns[:, :3], Rotation.from_quat(columns[:, 3:])

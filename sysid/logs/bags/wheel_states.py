@@ -4,8 +4,6 @@ The chair's state (whill_msgs/ModelCr2State, 2 to 20 Hz, no header) has motor an
 filtered speeds in km/h, and a right motor that counts down forward. At 2 Hz the speeds say which whole turn it was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,17 +33,20 @@ def chair_row(state: Any) -> tuple[float, float, float, float]:
 
 
 def chair_odometry(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
-    """Odometry (T, 5) x, y, yaw, v, omega of a chair's states: times of receipt (T,) [s] and `chair_row` of each (T,
-    4)."""
+    """Odometry (T, 5) x, y, yaw, v, omega of a chair's `chair_row`s (T, 4), received at times (T,) [s]."""
     dt = np.diff(t)[:, None]
     expected = (rows[1:, 2:] + rows[:-1, 2:]) / 2 * dt / wheel_radius
     turned = expected + np.remainder(np.diff(rows[:, :2], axis=0) - expected + np.pi, 2 * np.pi) - np.pi
-    return _odometry(t, np.vstack([np.zeros(2), np.cumsum(turned, axis=0)]), wheel_radius, track)
+    left, right = wheel_radius * np.vstack([np.zeros(2), np.cumsum(turned, axis=0)]).T
+    way, yaw = (left + right) / 2, (right - left) / track
+    half = np.diff(yaw) / 2
+    chord = np.diff(way) * np.sinc(half / np.pi)
+    x, y = (np.append(0.0, np.cumsum(chord * turn(yaw[:-1] + half))) for turn in (np.cos, np.sin))
+    return np.column_stack([x, y, yaw, np.gradient(way, t), np.gradient(yaw, t)])
 
 
 def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
-    """(T, 2) v and omega of wheels: rows (T, 4) of left and right angle [rad] and rate [rad/s], one of them nan where
-    it was not given, as `usable_joints` leaves them."""
+    """(T, 2) v and omega of `joint_row`s (T, 4), as `usable_joints` leaves them, at times (T,) [s]."""
     rates = rows[:, 2:]
     if not np.isfinite(rates).all():
         rates = np.gradient(np.column_stack([without_wraps(angle) for angle in rows[:, :2].T]), t, axis=0)
@@ -60,8 +61,7 @@ def usable_joints(rows: np.ndarray) -> np.ndarray:
 
 
 def joint_row(state: Any) -> tuple[float, float, float, float]:
-    """Left and right angle and rate, means over a side, of a JointState's wheels by their joints' names: nan where
-    the message has none, inf without any."""
+    """Left and right angle [rad] and rate [rad/s], means over a side's wheels: nan without, inf without any wheel."""
     sides = wheel_joints(state.name)
     if sides is None:
         return (float("inf"),) * 4
@@ -79,13 +79,3 @@ def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]] | None:
     left = [k for k in wheels if "left" in names[k].lower() or names[k].lower().startswith(("l_", "fl_", "rl_"))]
     right = [k for k in wheels if "right" in names[k].lower() or names[k].lower().startswith(("r_", "fr_", "rr_"))]
     return (left, right) if left and right else None
-
-
-def _odometry(t: np.ndarray, angles: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
-    """Odometry (T, 5) of wheel angles (T, 2) that do not wrap."""
-    left, right = (wheel_radius * angles).T
-    way, yaw = (left + right) / 2, (right - left) / track
-    half = np.diff(yaw) / 2
-    chord = np.diff(way) * np.sinc(half / np.pi)
-    x, y = (np.append(0.0, np.cumsum(chord * turn(yaw[:-1] + half))) for turn in (np.cos, np.sin))
-    return np.column_stack([x, y, yaw, np.gradient(way, t), np.gradient(yaw, t)])

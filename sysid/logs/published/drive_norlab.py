@@ -6,21 +6,18 @@ mean of its first five yaws but counted yaw from the first one; and an ICP updat
 neither.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from sysid.logs.gyro import sign_shown, with_sign
-from sysid.logs.hashes import hash_files
-from sysid.logs.planar import twist_of_wheels, yaw_of
+from sysid.logs.planar import turned_by, twist_of_wheels, yaw_of
 from sysid.logs.published.poses import CONVERT, HELD, LARGEST, MAX_GAP, MOVING, only_changes
-from sysid.logs.records import Command, GyroStream, Log, OdometryStream, Start, Trial
+from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, hash_files
 from whill_mjx.io.fields import counted, shown
 from whill_mjx.io.reading import csv_rows, read_arrays, read_gzip
 from whill_mjx.vehicle.specs import HUSKY, WARTHOG, VehicleSpec
@@ -42,8 +39,7 @@ YAW_RATE = "imu_z"  # of a continuous log
 
 
 def drive_spec(run: str) -> VehicleSpec:
-    """Nominal geometry of the robot that drove `run`, a Warthog unless its name says otherwise (the constants and their
-    sources are in whill_mjx.vehicle.specs)."""
+    """Nominal geometry of the robot that drove `run`, a Warthog unless its name says otherwise."""
     return HUSKY if HUSKY.name in run else WARTHOG
 
 
@@ -80,8 +76,7 @@ def most_runs(folder: Path) -> tuple[str, ...]:
 
 
 def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False) -> Log:
-    """Load DRIVE runs of one robot from a folder of .npz and .csv.gz files: a trial per window, named
-    RUN/STEP.WINDOW.
+    """Load DRIVE runs of one robot from a folder of .npz and .csv.gz files: a trial per window, as RUN/STEP.WINDOW.
 
     Args:
         runs: file stems, or groups of them, e.g. ("warthog_sand_1",).
@@ -119,20 +114,18 @@ def load_drive(folder: str | Path, runs: tuple[str, ...], chained: bool = False)
 def _window_trials(path: Path, run: str, chained: bool
                    ) -> tuple[list[Trial], str, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Trials of a run's windows, or of its steps where `chained`; a note; times [s] and gyro [rad/s] of each trial."""
-    blocks = _blocks(path)
-    spec = drive_spec(run)
-    command_v, command_omega = twist_of_wheels(blocks["cmd_left"], blocks["cmd_right"], spec.wheel_radius, spec.track)
-    wheel_v, wheel_omega = twist_of_wheels(blocks["left_wheel_vel"], blocks["right_wheel_vel"], spec.wheel_radius,
-                                           spec.track)
+    blocks, spec = _blocks(path), drive_spec(run)
+    command, wheels = (twist_of_wheels(blocks[left], blocks[right], spec.wheel_radius, spec.track) for left, right in (
+        ("cmd_left", "cmd_right"), ("left_wheel_vel", "right_wheel_vel")))
     x, y, yaw = in_first_frame(blocks["icp_x"], blocks["icp_y"], blocks["icp_yaw"])
     gyro, count = blocks["imu_yaw"], len(x)
     sign = sign_shown([(DT * gyro[row, 1:].sum(), yaw[row, -1]) for row in range(count)])
     gyro *= sign or 1.0
-    joints = _joints(x, y, yaw, wheel_v, gyro) if chained else None
+    joints = _joints(x, y, yaw, wheels[0], gyro) if chained else None
+    motion = np.stack([*command, *wheels, gyro])
     length = STEP_WINDOWS if chained else 1
     t = np.arange(ROWS * length) * DT
-    trials: list[Trial] = []
-    missed: list[tuple[float, float]] = []
+    trials, missed = list[Trial](), list[tuple[float, float]]()
     rates = {}
     for row in range(0, count - length + 1, length):
         rows = slice(row, row + length)
@@ -148,21 +141,26 @@ def _window_trials(path: Path, run: str, chained: bool
             if likely > BREAK:
                 before, after = (ROWS * (k - row) + joints.between[k]) * DT
                 breaks.append((float(before), float(after)))
-        command = Command(t, command_v[rows].ravel(), command_omega[rows].ravel())
-        odometry = OdometryStream(t, None, None, None, wheel_v[rows].ravel(), wheel_omega[rows].ravel())
-        start = Start(v=float(wheel_v[row, 0]), omega=float(wheel_omega[row, 0]), measured=True)
-        truth = only_changes(t, *pose)
-        if len(truth.t) == 0 or DT * np.abs(wheel_v[rows]).sum() + spec.track / 2 * DT * np.abs(
-                wheel_omega[rows]).sum() < MOVING:
+        mine, truth = motion[:, rows].reshape(len(motion), -1), only_changes(t, *pose)
+        _, _, way, turn, _ = DT * np.abs(mine).sum(axis=1)
+        if len(truth.t) == 0 or way + spec.track / 2 * turn < MOVING:
             continue
-        trials.append(Trial(name, f"{run}.{window}", command, odometry, truth, start, group=drive_group(run),
-                            breaks=tuple(breaks), gyro=GyroStream.of_rates(t, gyro[rows].ravel())))
-        rates[name] = t, gyro[rows].ravel()
+        trials.append(replace(_trial(name, run, t, mine, truth), manoeuvre=f"{run}.{window}", breaks=tuple(breaks)))
+        rates[name] = t, mine[4]
     note = f"{run}: {len(trials)} windows of {DT * ROWS * length:g} s"
     if sign != 1.0:
         note += (", whose gyro turns against the outside yaw: its sign is changed" if sign else
                  ", in which nothing turns enough to show the gyro's sign: it is taken as logged")
     return trials, note + (_said_missed(missed) if chained else ""), rates
+
+
+def _trial(name: str, run: str, t: np.ndarray, motion: np.ndarray, truth: PoseStream) -> Trial:
+    """A window of a run that starts as measured; motion (5, T): commanded speed and yaw rate, those of the wheels, and
+    the gyro's, nan where it was not logged."""
+    _, _, v, omega, turning = motion
+    return Trial(name, run, Command(t, *motion[:2]), OdometryStream(t, None, None, None, v, omega), truth,
+                 Start(v=float(v[0]), omega=float(omega[0]), measured=True), group=drive_group(run),
+                 gyro=GyroStream.of_rates(t, turning) if np.isfinite(turning).all() else None)
 
 
 def _blocks(path: Path) -> dict[str, np.ndarray]:
@@ -203,9 +201,7 @@ def in_first_frame(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> tuple[np.nd
     The publishers' converter (dataset_parser.py, build_torch_ready_dataset) turned the positions by the mean of the
     first five yaws, which it did not unwrap: where yaw passes +-pi within them the mean is far off.
     """
-    turned = yaw[:, :FRAME_SAMPLES].mean(axis=1, keepdims=True)
-    cos, sin = np.cos(turned), np.sin(turned)
-    return cos * x - sin * y, sin * x + cos * y, np.unwrap(yaw, axis=1)
+    return *turned_by(x, y, yaw[:, :FRAME_SAMPLES].mean(axis=1, keepdims=True)), np.unwrap(yaw, axis=1)
 
 
 @dataclass(frozen=True)
@@ -267,58 +263,39 @@ def _chain(
     """Both windows in the frame of the first, the second of which starts that far on [m, rad]."""
     x0, y0, yaw0 = (float(values[-1]) for values in first)
     x0, y0, yaw0 = x0 + way * np.cos(yaw0 + turn / 2), y0 + way * np.sin(yaw0 + turn / 2), yaw0 + turn
-    cos, sin = np.cos(yaw0), np.sin(yaw0)
-    x, y, yaw = second
-    return (np.concatenate([first[0], x0 + cos * x - sin * y]), np.concatenate([first[1], y0 + sin * x + cos * y]),
-            np.concatenate([first[2], yaw0 + yaw]))
+    x, y = turned_by(*second[:2], yaw0)
+    return tuple(np.append(one, other) for one, other in zip(first, (x0 + x, y0 + y, yaw0 + second[2]), strict=True))
 
 
 def _continuous_trials(path: Path, run: str, window: float) -> tuple[list[Trial], str]:
     """Windows of the continuous log during its calibration phases (elsewhere a joystick drove and was not logged)."""
-    columns, times, states = _read_rows(path)
-
-    def column(name: str) -> np.ndarray:
-        values = np.array(columns[name])
+    (columns, times, states), spec = _read_rows(path), drive_spec(run)
+    t = _nanoseconds(path, times)
+    for name, values in columns.items():
         if (np.abs(values) >= LARGEST).any():
             raise ValueError(f"{path}: {name} is {LARGEST:g} or more. {CONVERT}.")
-        return values
-
-    spec = drive_spec(run)
-    t = _nanoseconds(path, times)
-    calibrating = np.array(states)
-    yaw = np.unwrap(yaw_of(*(column(f"icp_quat_{axis}") for axis in "wxyz")))
-    x, y = column("icp_pos_x"), column("icp_pos_y")
-    wheel_v, wheel_omega = twist_of_wheels(column("meas_left_vel"), column("meas_right_vel"), spec.wheel_radius,
-                                           spec.track)
-    command_v, command_omega = column("cmd_vel_x"), column("cmd_vel_omega")
-    turning = column(YAW_RATE) if YAW_RATE in columns else np.full(len(t), np.nan)
-    finite = np.isfinite([x, y, yaw, wheel_v, wheel_omega, command_v, command_omega]).all(axis=0)
+    yaw = np.unwrap(yaw_of(*(columns[f"icp_quat_{axis}"] for axis in "wxyz")))
+    place = np.stack([columns["icp_pos_x"], columns["icp_pos_y"], yaw])
+    motion = np.stack([columns["cmd_vel_x"], columns["cmd_vel_omega"], *twist_of_wheels(
+        columns["meas_left_vel"], columns["meas_right_vel"], spec.wheel_radius, spec.track),
+        columns.get(YAW_RATE, np.full(len(t), np.nan))])
+    usable = np.array(states) & np.isfinite([*place, *motion[:4]]).all(axis=0)
     trials = []
     for number, begin in enumerate(np.arange(0.0, t[-1] - window, window)):
         inside = np.flatnonzero((t >= begin) & (t < begin + window))
-        if len(inside) < 10 or not (calibrating & finite)[inside].all() or np.diff(t[inside]).max() > MAX_GAP:
+        if len(inside) < 10 or not usable[inside].all() or np.diff(t[inside]).max() > MAX_GAP:
             continue
-        first = inside[0]
-        now = t[inside] - t[first]
-        cos, sin = np.cos(yaw[first]), np.sin(yaw[first])
-        dx, dy = x[inside] - x[first], y[inside] - y[first]
-        truth = only_changes(now, cos * dx + sin * dy, -sin * dx + cos * dy, yaw[inside] - yaw[first])
-        if len(truth.t) == 0 or np.abs(wheel_v[inside]).max() + np.abs(wheel_omega[inside]).max() < MOVING:
-            continue
-        command = Command(now, command_v[inside], command_omega[inside])
-        odometry = OdometryStream(now, None, None, None, wheel_v[inside], wheel_omega[inside])
-        start = Start(v=float(wheel_v[first]), omega=float(wheel_omega[first]), measured=True)
-        gyro = GyroStream.of_rates(now, turning[inside]) if np.isfinite(turning[inside]).all() else None
-        trials.append(Trial(f"{run}/{number:03d}", run, command, odometry, truth, start, group=drive_group(run),
-                            gyro=gyro))
+        now, mine = t[inside] - t[inside[0]], motion[:, inside]
+        truth = only_changes(now, *PoseStream(now, *place[:, inside]).seen_from(*place[:, inside[0]]).values.T)
+        if len(truth.t) and np.abs(mine[2:4]).max(axis=1).sum() >= MOVING:
+            trials.append(_trial(f"{run}/{number:03d}", run, now, mine, truth))
     signed, said = with_sign(trials)
     note = "; ".join([f"{run}: {len(trials)} windows of {window:g} s during calibration phases", *said])
     return list(signed), note
 
 
-def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
-    """Numbers by column (nan where none), times and whether calibrating, of a continuous log; its first row is filler.
-    """
+def _read_rows(path: Path) -> tuple[dict[str, np.ndarray], list[str], list[bool]]:
+    """Numbers by column (nan where none), times and whether calibrating; the first row of such a log is filler."""
     rows = csv_rows(path, read_gzip(path, "missing. Give the file of a run.", f"{CONVERT}."))
     header = next(rows, (0, []))[1]
     for name in (*CONTINUOUS_COLUMNS, "ros_time", "calib_state"):
@@ -342,7 +319,7 @@ def _read_rows(path: Path) -> tuple[dict[str, array], list[str], list[bool]]:
         states.append(row[index["calib_state"]] == "calib")
     if len(times) < 2:
         raise ValueError(f"{path}: {counted(len(times), 'row')} of data; at least 2 are needed. {CONVERT}.")
-    return columns, times, states
+    return {name: np.array(values) for name, values in columns.items()}, times, states
 
 
 def _nanoseconds(path: Path, texts: list[str]) -> np.ndarray:

@@ -1,10 +1,5 @@
-"""The MRCLAM set: five iRobot Create and motion capture.
-
-UTIAS Multi-Robot Cooperative Localization and Mapping (Leung et al., IJRR 2011,
-asrl.utias.utoronto.ca/datasets/mrclam).
-"""
-
-from __future__ import annotations
+"""The MRCLAM set, five iRobot Create and motion capture: UTIAS Multi-Robot Cooperative Localization and Mapping (Leung
+et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam)."""
 
 import io
 import warnings
@@ -14,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.logs.hashes import hash_files
 from sysid.logs.published.poses import HELD, LARGEST, MAX_GAP, only_changes
-from sysid.logs.records import Command, Log, PoseStream, Start, Trial
+from sysid.logs.records import Command, Log, PoseStream, Start, Trial, hash_files, spaced
 from whill_mjx.io.reading import ARRAY_BYTES, LONGEST_REASON, read_gzip, read_text
 from whill_mjx.vehicle.specs import CREATE
 
@@ -46,13 +40,9 @@ def mrclam_robots(keys: Sequence[str]) -> tuple[int, ...]:
 def load_mrclam(folder: str | Path, robots: tuple[int, ...] = (1, 2, 3, 4, 5)) -> Log:
     """Load MRCLAM robots as consecutive windows in which the robot was commanded to move."""
     folder = Path(folder)
-    trials: list[Trial] = []
-    notes = []
-    for robot in robots:
-        robot_trials, note = _mrclam_robot(folder, robot, MRCLAM_WINDOW)
-        trials += robot_trials
-        notes.append(note)
-    return Log("mrclam", CREATE, tuple(trials), hash_files(folder), tuple(notes))
+    found = [_mrclam_robot(folder, robot, MRCLAM_WINDOW) for robot in robots]
+    return Log("mrclam", CREATE, tuple(trial for trials, _ in found for trial in trials), hash_files(folder),
+               tuple(note for _, note in found))
 
 
 def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial], str]:
@@ -75,9 +65,10 @@ def _mrclam_robot(folder: Path, robot: int, window: float) -> tuple[list[Trial],
         if not (np.abs(v) > 0.005).any() and not (np.abs(omega) > 0.02).any():
             continue
         pose = only_changes(path[inside, 0] - t0, *path[inside, 1:].T)
+        some = spaced(pose.t, MRCLAM_SPACING)
         start = replace(_speeds(path, t0), x=float(path[first, 1]), y=float(path[first, 2]), yaw=float(path[first, 3]))
         trials.append(Trial(f"robot{robot}/{number:03d}", f"robot{robot}", Command(t[keep], v[keep], omega[keep]), None,
-                            thin(pose, MRCLAM_SPACING), start, group=f"robot{robot}"))
+                            PoseStream(*(one[some] for one in vars(pose).values())), start, group=f"robot{robot}"))
     return trials, f"robot {robot}: {len(trials)} windows of {window:g} s; start speeds are those of the outside pose"
 
 
@@ -88,16 +79,6 @@ def _speeds(path: np.ndarray, at: float) -> Start:
     vx, vy, omega = t @ near[:, 1:] / max(float(t @ t), HELD)
     yaw = near[:, 3].mean()
     return Start(v=float(vx * np.cos(yaw) + vy * np.sin(yaw)), omega=float(omega), measured=True)
-
-
-def thin(pose: PoseStream, spacing: float) -> PoseStream:
-    """The stream with samples at least `spacing` seconds apart."""
-    keep, last = [], -np.inf
-    for i, t in enumerate(pose.t):
-        if t - last >= spacing:
-            keep.append(i)
-            last = t
-    return PoseStream(pose.t[keep], pose.x[keep], pose.y[keep], pose.yaw[keep])
 
 
 def _read_table(folder: Path, robot: int, kind: str, columns: int) -> np.ndarray:

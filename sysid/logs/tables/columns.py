@@ -1,7 +1,5 @@
 """A table of numbers, and what one of its columns holds: a role, and a unit with its size in SI."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -34,8 +32,7 @@ SPELLED = {
 }
 PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")  # A unit of ticks: so many in a turn
 PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")  # A unit of rows: so many in a second
-TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-"""Columns of a trajectory in TUM's form."""
+TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")  # columns of a trajectory in TUM's form
 SAID = "as said"  # why a column has its role where somebody gave no unit
 
 

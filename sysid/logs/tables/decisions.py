@@ -1,7 +1,5 @@
 """What the columns of a drive hold: as the user said, as guessed, and as answered on a terminal."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -22,10 +20,7 @@ FAR_MORE, STEEP, LEAST_WAY = 3.0, 0.3, 0.3
 
 
 def read_decision(text: str, tables: Sequence[Table]) -> Column:
-    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it; a minus before the unit, or in its place, turns the sign.
-
-    ValueError where it is none.
-    """
+    """One `ROLE=[FILE/]COLUMN[:UNIT]` as somebody wrote it; a minus before the unit, or for it, turns the sign."""
     role, equals, rest = text.partition("=")
     role, rest = role.strip(), rest.strip()
     if not equals or role not in ROLES:
@@ -50,11 +45,7 @@ def read_decision(text: str, tables: Sequence[Table]) -> Column:
 
 
 def decisions_of(tables: Sequence[Table], said: Sequence[str]) -> list[Column]:
-    """The decisions that are of these files.
-
-    Raises:
-        ValueError: two of them are of one column, or give one role to two.
-    """
+    """The decisions that are of these files; ValueError where two are of one column, or give one role to two."""
     found: dict[tuple[str, ...], str] = {}
     columns = []
     for text in dict.fromkeys(said):
@@ -130,27 +121,32 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         values = arrays[one.file, one.name]
         if one.role == "time" and one.file in used and np.nanmin(values) == np.nanmax(values):
             return f"time stands still in {one.file}/{one.name}."
-    commands = _has(roles, "command", "v") or _has(roles, "command", "left", "right")
+    pair, wheels = ({f"{stream}.left", f"{stream}.right"} <= roles for stream in ("command", "wheels"))
+    wheels |= {"wheels.left_angle", "wheels.right_angle"} <= roles
+    speeds, place, outside = {"odometry.v", "odometry.omega"} <= roles, {"odometry.x", "odometry.y"} <= roles, {
+        "ground_truth.x", "ground_truth.y"} <= roles
+    commands = "command.v" in roles or pair
     if not commands and (found := [one for one in columns if one.role.startswith("command.")]):
         return (f"{found[0].file}/{found[0].name} is the only part of a command: v and omega, or left and right belong "
                 "to it.")
-    if _has(roles, "command", "v") and "command.omega" not in roles and (turn := _turned(columns, arrays)) > TURNED:
+    if {"command.v", "command.omega"} & roles == {"command.v"} and (turn := _turned(columns, arrays)) > TURNED:
+        unused = first_of(unused_columns(tables, columns))
         return (f"no column is the commanded yaw rate, though the vehicle turns by {turn:.2g} rad: "
-                f"{_unused(tables, columns)}. If none was commanded, add a column of zeros for it.")
-    inputs = _has(roles, "command", "v", "omega") or _has(roles, "command", "left", "right") or _wheels(roles)
-    measured = _has(roles, "ground_truth", "x", "y") or _has(roles, "odometry", "v", "omega") or _has(
-        roles, "odometry", "x", "y")
-    if not inputs and not measured:
-        return "no column is surely a command, a wheel speed or a pose."
-    if {"odometry.v", "odometry.omega"} & roles and not _has(roles, "odometry", "x", "y") and not _has(
-            roles, "odometry", "v", "omega"):
-        return "the odometry has only one of v and omega."
-    if not inputs and not _has(roles, "odometry", "v", "omega"):
-        return "there are neither commands (v, omega) nor wheel speeds."
-    if not commands and not _has(roles, "ground_truth", "x", "y"):
-        return "there are measured speeds, and neither commands nor an outside pose to compare them with."
-    if not measured and not (_wheels(roles) and commands):
-        return "there is neither odometry (v, omega or x, y, yaw) nor an outside pose."
+                f"{f'not used: {unused}' if unused else 'all columns are used'}. If none was commanded, add a column "
+                "of zeros for it.")
+    inputs = {"command.v", "command.omega"} <= roles or pair or wheels
+    measured = outside or speeds or place
+    for holds, said in (
+            (not inputs and not measured, "no column is surely a command, a wheel speed or a pose."),
+            ({"odometry.v", "odometry.omega"} & roles and not place and not speeds,
+             "the odometry has only one of v and omega."),
+            (not inputs and not speeds, "there are neither commands (v, omega) nor wheel speeds."),
+            (not commands and not outside,
+             "there are measured speeds, and neither commands nor an outside pose to compare them with."),
+            (not measured and not (wheels and commands),
+             "there is neither odometry (v, omega or x, y, yaw) nor an outside pose.")):
+        if holds:
+            return said
     if unsure := [one for one in columns if not one.sure]:
         ticks = next((f" If it counts ticks, say how many make a turn: {one.role}={one.file}/{one.name}:N/rev."
                       for one in unsure if TICKS.search(one.name)), "")
@@ -190,16 +186,7 @@ def _turned(columns: Sequence[Column], arrays: Mapping[tuple[str, str], np.ndarr
     return min(spans, default=0.0)
 
 
-def _unused(tables: Sequence[Table], columns: Sequence[Column]) -> str:
-    """The columns without a role, as a clause."""
+def unused_columns(tables: Sequence[Table], columns: Sequence[Column]) -> list[str]:
+    """The columns without a role, each as FILE/COLUMN."""
     used = {(one.file, one.name) for one in columns}
-    names = [f"{table.stem}/{name}" for table in tables for name in table.columns if (table.stem, name) not in used]
-    return f"not used: {first_of(names)}" if names else "all columns are used"
-
-
-def _has(roles: set[str], stream: str, *quantities: str) -> bool:
-    return all(f"{stream}.{one}" in roles for one in quantities)
-
-
-def _wheels(roles: set[str]) -> bool:
-    return _has(roles, "wheels", "left", "right") or _has(roles, "wheels", "left_angle", "right_angle")
+    return [f"{table.stem}/{name}" for table in tables for name in table.columns if (table.stem, name) not in used]

@@ -1,7 +1,5 @@
 """Drives out of somebody else's CSV and TUM files: which columns they have, joined by time, in SI units."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sysid.logs.tables.columns import QUANTITIES, Column, Table
-from sysid.logs.tables.decisions import decide, decisions_of, first_of
+from sysid.logs.tables.decisions import decide, decisions_of, first_of, unused_columns
 from sysid.logs.tables.guess import guess, shown_units
 from sysid.logs.tables.streams import as_odometry, as_twist, backward_wheel, dead_reckoned, stream_rows, with_rates
 from sysid.logs.tables.text_table import read_table, text_files
@@ -35,16 +33,14 @@ class TextDrive:
 def read_drives(
     source: Path, said: Sequence[str], geometry: tuple[float, float], wheels: bool = False
 ) -> tuple[list[TextDrive], list[str]]:
-    """The drives of a CSV file, a TUM file or a folder of them, and notes on what is left out; ValueError where none
-    is clear.
+    """The drives of a CSV or TUM file or a folder of them, and notes on what is left out; ValueError if none is clear.
 
     Args:
         said: decisions, each ROLE=[FILE/]COLUMN[:UNIT]; the rest is guessed.
         geometry: wheel radius and track [m], of wheel speeds.
         wheels: take measured wheel speeds as the input, and leave commands out.
     """
-    groups: list[tuple[str, list[Table]]] = []
-    refused: list[ValueError] = []
+    groups, refused = list[tuple[str, list[Table]]](), list[ValueError]()
     for files in text_files(source):
         found = []
         for path in files:
@@ -79,9 +75,7 @@ def join_drives(
 ) -> tuple[list[TextDrive], list[str]]:
     """Drives of tables by name, otherwise as `read_drives`; one that is not clear does not keep out the others."""
     units = shown_units([guess(tables, decisions_of(tables, said)) for _, tables in groups]) if len(groups) > 1 else {}
-    drives: list[TextDrive] = []
-    refused: list[ValueError] = []
-    agreed: list[str] = list(said)
+    drives, refused, agreed = list[TextDrive](), list[ValueError](), list(said)
     for name, tables in groups:
         try:
             columns, agreed = decide(source, tables, agreed, units, wheels)
@@ -149,10 +143,9 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     if begin >= end:
         spans = "; ".join(f"{key} {one[0, 0]:.3f} to {one[-1, 0]:.3f} s" for key, one in made.items())
         raise ValueError(f"{source}: the streams of {name} share no time ({spans}). Put them on one clock first.")
-    used = {(one.file, one.name) for one in columns}
-    unused = [f"{table.stem}/{one}" for table in tables for one, values in table.columns.items()
-              if (table.stem, one) not in used and np.nanmin(values) < np.nanmax(values)]
-    if unused:
+    changing = [replace(table, columns={name: values for name, values in table.columns.items()
+                                        if np.nanmin(values) < np.nanmax(values)}) for table in tables]
+    if unused := unused_columns(changing, columns):
         notes.append(f"not used: {first_of(unused)}")
     notes = list(dict.fromkeys(note.removeprefix(f"{name}: ") for note in notes))
     return TextDrive(name, made, tuple(columns), tuple(notes), measured_input)

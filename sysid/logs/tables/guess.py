@@ -4,8 +4,6 @@ A role is STREAM.QUANTITY, such as command.v or ground_truth.yaw; "time" is that
 from the name where it is there, else from the numbers.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,7 +26,9 @@ def guess(
     """
     found = list(said)
     taken = {(one.file, one.name) for one in said}
-    settled = _settled_commands({one.role for one in said})
+    forms = [{f"command.{one}" for one in form} for form in (("v", "omega"), ("left", "right"))]
+    settled = {role for form, other in zip(forms, reversed(forms), strict=True)  # the other form of a whole command
+               if form <= {one.role for one in said} for role in other}
     for table in tables:
         roles = {one.role for one in found if one.role != "time"}
         candidates = [column for name in table.columns if (table.stem, name) not in taken
@@ -59,12 +59,6 @@ def _with_headings(candidates: Sequence[Column], roles: set[str]) -> list[Column
     return [replace(one, role=f"{stream}.yaw") if quantity == "omega" and stream in lacking
             and may_be_heading(one.name, one.unit) else one
             for one in candidates for stream, _, quantity in [one.role.partition(".")]]
-
-
-def _settled_commands(said: set[str]) -> set[str]:
-    """Roles of commands that are not looked for: those of the other form, where somebody said a whole command."""
-    forms = [{f"command.{one}" for one in form} for form in (("v", "omega"), ("left", "right"))]
-    return {role for form, other in zip(forms, reversed(forms), strict=True) if form <= said for role in other}
 
 
 def shown_units(drives: Sequence[Sequence[Column]]) -> dict[tuple[str, str], str]:

@@ -4,8 +4,6 @@ Names are those of ROS exports (`pose.pose.position.x`), of plotting programs (`
 people (`cmd_v [km/h]`).
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -33,8 +31,7 @@ QUANTITY_WORDS = {
 }
 TURNS, RATES = {"turn", "rot", "ang"}, {"rate", "vel", "velocity", "speed", "dot"}
 """Words for a heading or its rate, and those that say a rate beside them."""
-PLURALS = {"rads", "degs"}
-"""Units of headings too, though of rates they are rad/s and deg/s."""
+PLURALS = {"rads", "degs"}  # units of headings too, though of rates they are rad/s and deg/s
 TICKS = re.compile(r"tick|count|enc(oder)?s?([ _]|$)", re.IGNORECASE)
 """In the names of wheel angles that an encoder counts."""
 COUNTS = re.compile(r"frame|index|sample|row|seq", re.IGNORECASE)  # in the names of columns that count rows
@@ -180,8 +177,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def may_be_heading(name: str, unit: str) -> bool:
-    """Whether what is a yaw rate by its name is a heading by its unit: a turn in degrees. Where a name says a rate, as
-    `yaw_rate_deg`, people left the second out."""
+    """Whether a yaw rate by its name is a heading by its unit, and not a rate as `yaw_rate_deg`, without the second."""
     words = set(words_of(name))
     return unit in UNITS["angle"] and bool(words & TURNS) and not words & RATES
 

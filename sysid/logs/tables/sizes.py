@@ -1,13 +1,11 @@
 """Units that numbers show: a speed must be the rate of its pose, a measured speed about the commanded one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.planar import yaw_of
+from sysid.logs.planar import differenced, yaw_of
 from sysid.logs.tables.columns import UNITS, Column, is_unit_of, kind_of, size_of
 
 FASTEST_STEP, SLOWEST_STEP = 5e-4, 4.0  # s; rows that follow faster, or slower, are in another unit of time
@@ -27,6 +25,7 @@ ALIKE = 0.25  # relative difference from a unit's size within which numbers agre
 LARGEST_SI = 4.0  # m/s and rad/s that speeds of a vehicle usually stay below
 BUSY = 0.3  # of its usual largest, above which a signal is compared: a vehicle may turn seldom
 GAP = 2.0  # s without samples, over which nothing is interpolated
+Signal = tuple[np.ndarray, np.ndarray]  # times (T,) [s] and values (T,)
 
 
 def with_time_unit(column: Column, values: np.ndarray) -> Column:
@@ -89,7 +88,7 @@ class _Known:
     clocks: dict[str, Column]  # by file
     arrays: Mapping[tuple[str, str], np.ndarray]
 
-    def signal(self, role: str, unit: str = "") -> tuple[np.ndarray, np.ndarray] | None:
+    def signal(self, role: str, unit: str = "") -> Signal | None:
         """Times [s] and values of a role in SI units; None where there are few, or its unit is not known."""
         one = self.columns.get(role)
         clock = self.clocks.get(one.file) if one is not None else None
@@ -100,12 +99,11 @@ class _Known:
         good = np.isfinite(t) & np.isfinite(values)
         return (t[good], values[good]) if good.sum() > 20 else None
 
-    def raw(self, role: str) -> tuple[np.ndarray, np.ndarray] | None:
+    def raw(self, role: str) -> Signal | None:
         """The same as if it were in SI units already."""
         return self.signal(role, next(iter(UNITS[kind_of(role)])))
 
-    def settle(self, role: str, reference: tuple[np.ndarray, np.ndarray] | None, why: str, loose: float = ALIKE
-               ) -> None:  # fmt: skip
+    def settle(self, role: str, reference: Signal | None, why: str, loose: float = ALIKE) -> None:
         """Find the unit in which a signal is as large as a reference."""
         one, mine = self.columns.get(role), self.raw(role)
         if one is None or one.unit in UNITS[kind_of(role)] or mine is None:
@@ -114,7 +112,7 @@ class _Known:
         if unit is not None:
             self.columns[role] = replace(one, unit=unit, why=f"{one.why}; {why}")
 
-    def settle_wheels(self, reference: tuple[np.ndarray, np.ndarray] | None) -> None:
+    def settle_wheels(self, reference: Signal | None) -> None:
         """Find whether wheel speeds are those of their rims: no wheel has a radius of a metre, or of a millimetre."""
         for stream in ("wheels", "command"):
             sides = [self.raw(f"{stream}.{side}") for side in ("left", "right")]
@@ -136,8 +134,8 @@ class _Known:
             unit, why = shown or ("deg" if span > 30 else "rad", "its range")
             self.columns[role] = replace(one, unit=unit, why=f"{one.why}; {why}", assumed=shown is None,
                                          sure=one.sure and (shown is not None or span < TURNED), moves=span > TURNED)
-        axes = [self.raw(f"{stream}.{axis}") for axis in ("x", "y")]
-        rate = max((float(np.percentile(np.abs(_rate(*one)[1]), 90)) for one in axes if one is not None), default=0.0)
+        axes = [place for axis in ("x", "y") if (place := self.raw(f"{stream}.{axis}"))]
+        rate = max((float(np.percentile(np.abs(_rate(*place)[1]), 90)) for place in axes), default=0.0)
         for role in (f"{stream}.x", f"{stream}.y"):
             if (one := self.columns.get(role)) and one.unit not in UNITS["length"] and self.raw(role):
                 self.columns[role] = replace(one, unit="mm" if rate > TOO_FAST else "m", why=f"{one.why}; its rate",
@@ -146,7 +144,7 @@ class _Known:
             if one := self.columns.get(role):
                 self.columns[role] = replace(one, unit="-")
 
-    def _along_path(self, stream: str, yaw: tuple[np.ndarray, np.ndarray]) -> tuple[str, str] | None:
+    def _along_path(self, stream: str, yaw: Signal) -> tuple[str, str] | None:
         """The unit in which a heading follows the direction of the path, and why; None where several do, or none."""
         x, y = self.raw(f"{stream}.x"), self.raw(f"{stream}.y")
         if x is None or y is None or len(x[0]) != len(y[0]):
@@ -165,7 +163,7 @@ class _Known:
         clear = apart[unit] < 1 - ALONG and apart[other] > CLEARER * apart[unit] + 0.01
         return (unit, "as the path turns") if clear else None
 
-    def _as_turned(self, yaw: tuple[np.ndarray, np.ndarray]) -> tuple[str, str] | None:
+    def _as_turned(self, yaw: Signal) -> tuple[str, str] | None:
         """The unit in which a heading turns as fast as a yaw rate says, and why; None where neither is."""
         roles = [role for role in ("odometry.omega", "command.omega") if role in self.columns]
         for role in sorted(roles, key=lambda one: self.signal(one) is None):
@@ -182,7 +180,7 @@ class _Known:
                 return "rad", why
         return None
 
-    def heading(self, stream: str) -> tuple[np.ndarray, np.ndarray] | None:
+    def heading(self, stream: str) -> Signal | None:
         """Times [s] and heading [rad] of a pose, without jumps."""
         parts = {one: part for one in ("qw", "qx", "qy", "qz") if (part := self.signal(f"{stream}.{one}"))}
         if {"qw", "qz"} <= set(parts) and len({len(part[0]) for part in parts.values()}) == 1:
@@ -193,14 +191,11 @@ class _Known:
         return (yaw[0], np.unwrap(yaw[1])) if yaw else None
 
 
-def _first(*signals: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray] | None:
+def _first(*signals: Signal | None) -> Signal | None:
     return next((one for one in signals if one is not None), None)
 
 
-def _unit_like(
-    mine: tuple[np.ndarray, np.ndarray], reference: tuple[np.ndarray, np.ndarray] | None, units: Mapping[str, float],
-    loose: float,
-) -> str | None:
+def _unit_like(mine: Signal, reference: Signal | None, units: Mapping[str, float], loose: float) -> str | None:
     """The unit in which a signal is as large as a reference; None where they are not alike or no unit fits."""
     if reference is None:
         return None
@@ -208,18 +203,18 @@ def _unit_like(
     if len(t) < 40:
         return None
     ours, theirs = (np.abs(np.interp(t, *one)) for one in (mine, reference))
-    if max(ours.max(), theirs.max()) < 1e-6 or ours.max() < 1e-9 or theirs.max() < 1e-3:
+    if ours.max() < 1e-9 or theirs.max() < 1e-3:
         return None
     busy = np.convolve(ours > BUSY * np.percentile(ours, 99), np.ones(39), "same") > 0  # and 1 s around: it may be late
     if not busy.any():
         return None
     ratio = float(np.percentile(theirs[busy], 90) / max(np.percentile(ours[busy], 90), 1e-12))
+    if ratio <= 0:
+        return None
     apart: dict[str, float] = {}  # ft/s, for example, is too near to km/h for numbers to separate them
     for one, size in units.items():
         if all(abs(np.log(size / other)) > np.log(1 + ALIKE) for other in apart.values()):
             apart[one] = size
-    if ratio <= 0:
-        return None
     unit = min(apart, key=lambda one: abs(np.log(ratio / apart[one])))
     return unit if abs(np.log(ratio / apart[unit])) < np.log(1 + loose) + 0.05 else None
 
@@ -233,7 +228,7 @@ def _begun_anew(yaw: np.ndarray) -> tuple[str, str] | None:
     return None
 
 
-def _gain(heading: tuple[np.ndarray, np.ndarray], rate: tuple[np.ndarray, np.ndarray]) -> float:
+def _gain(heading: Signal, rate: Signal) -> float:
     """How many times as fast a heading turns as a yaw rate says; 0 where it does not follow it."""
     t, turned = _rate(*heading)
     inside = (t >= rate[0][0]) & (t <= rate[0][-1])
@@ -248,24 +243,24 @@ def _is_near(gain: float) -> bool:
     return 1 / SLIPPED < gain < SLIPPED
 
 
-def _rate(t: np.ndarray, values: np.ndarray, over: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
+def _rate(t: np.ndarray, values: np.ndarray, over: float = 0.2) -> Signal:
     """Rate of a signal (T,) over so many seconds, at 20 Hz."""
     grid = _grid(t, t[0] + over / 2, t[-1] - over / 2)
     if len(grid) < 2:
         return t[:1], np.zeros(1)
-    return grid, (np.interp(grid + over / 2, t, values) - np.interp(grid - over / 2, t, values)) / over
+    return grid, differenced(t, values, grid, over / 2)
 
 
 def _grid(t: np.ndarray, begin: float, end: float) -> np.ndarray:
     """Times at 20 Hz from `begin` to `end`, but for gaps of more than GAP in the samples' times (T,)."""
-    inside = np.unique(np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])) if end > begin else np.zeros(0)
-    pieces = [np.arange(one[0], one[-1], 0.05) for one in np.split(inside, np.flatnonzero(np.diff(inside) > GAP) + 1)
-              if len(one)]  # fmt: skip
-    return np.concatenate([*pieces, np.zeros(0)])
+    if end <= begin:
+        return np.zeros(0)
+    inside = np.unique(np.concatenate([[begin], t[(t > begin) & (t < end)], [end]]))
+    pieces = np.split(inside, np.flatnonzero(np.diff(inside) > GAP) + 1)
+    return np.concatenate([np.arange(one[0], one[-1], 0.05) for one in pieces])
 
 
-def _way(x: tuple[np.ndarray, np.ndarray] | None, y: tuple[np.ndarray, np.ndarray] | None
-         ) -> tuple[np.ndarray, np.ndarray] | None:
+def _way(x: Signal | None, y: Signal | None) -> Signal | None:
     if x is None or y is None or len(x[0]) != len(y[0]):
         return None
     (t, vx), (_, vy) = _rate(*x), _rate(*y)

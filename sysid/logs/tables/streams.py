@@ -1,15 +1,14 @@
 """Streams out of tables: rows in order of time, in SI units, as v and omega and as a pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 
 from sysid.logs.directions import RESPONSE, VARIED
 from sysid.logs.planar import DIFFERENCED, integrate_speeds, pose_speeds, twist_of_wheels, without_wraps, yaw_of
+from sysid.logs.records import Command
 from sysid.logs.tables.columns import UNITS, Column, Table
-from sysid.logs.tables.headers import ONE_SIDE
+from sysid.logs.tables.text_table import ONE_SIDE
 from whill_mjx.io.fields import counted
 
 FOLLOWED, UNFOLLOWED = 0.7, 0.5  # correlation with a command of what follows it, and of what does not
@@ -28,9 +27,8 @@ def stream_rows(
     mine = [one for one in mine if one.file == file]
     table = next(one for one in tables if one.stem == file)
     clock = next(one for one in columns if one.role == "time" and one.file == file)
-    found = {"t": clock.in_si(table.columns[clock.name])}
-    for one in mine:
-        found[one.role.partition(".")[2]] = one.in_si(table.columns[one.name])
+    found = {"t": clock.in_si(table.columns[clock.name]),
+             **{one.role.partition(".")[2]: one.in_si(table.columns[one.name]) for one in mine}}
     whole = np.isfinite(list(found.values())).all(axis=0)
     found = {key: values[whole] for key, values in found.items()}
     notes = _check_clock(file, found["t"])
@@ -113,8 +111,7 @@ def as_twist(rates: dict[str, np.ndarray], columns: Sequence[Column], stream: st
 def backward_wheel(command: np.ndarray, wheels: np.ndarray) -> str:
     """The wheel, "left" or "right", whose difference from the other one follows the commanded speed as their mean
     should; empty where it is not so. Rows (T, 3) of t, v and omega."""
-    held = np.searchsorted(command[:, 0], wheels[:, 0] - RESPONSE, side="right") - 1
-    sent = np.where(held >= 0, command[np.maximum(held, 0), 1], 0.0)
+    sent = Command(*command.T).at(wheels[:, 0] - RESPONSE, (0.0, 0.0))[0]
     if sent.std() < VARIED or min(wheels[:, 1].std(), wheels[:, 2].std()) == 0.0:  # their unit may be another
         return ""
     mean, difference = (float(np.corrcoef(sent, wheels[:, k])[0, 1]) for k in (1, 2))

@@ -1,19 +1,25 @@
-"""A wheel that counts backwards: driving straight then looks like a turn, and a turn like driving straight.
+"""What a log shows to be wrong with the wheels: one that counts backwards, and nominal sizes that are not theirs.
 
 v and omega give the speeds of the two rims, v -+ omega track / 2. Negating the left one turns them into omega track / 2
-and 2 v / track; negating the right one turns them into the negatives of these.
+and 2 v / track; negating the right one turns them into the negatives of these. Where the sizes are wrong, the outside
+pose goes or turns further than the odometry, which uses them.
 """
 
-from __future__ import annotations
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from sysid.logs.directions import ALIKE, RESPONSE, UNLIKE, VARIED, likeness
+from sysid.logs.directions import ALIKE, APART, RESPONSE, SURE, UNLIKE, VARIED, WHOLE, direction, likeness, motion_of
 from sysid.logs.records import Log, Trial
-from sysid.logs.streams import speeds
+from sysid.logs.streams import GRID_DT, clock_shift, speeds
+from whill_mjx.vehicle.specs import VehicleSpec
 
 STILL = 1e-3  # standard deviation of a speed that hardly changes
 LEAST = {True: 0.1, False: 0.4}  # gain of a yaw rate that follows, of a skid drive, which scrubs, and of others
+USUAL = 0.06  # share by which data sheets, worn tyres and creeping wheels make a size differ
+
+Gain = tuple[float, float]  # outside motion over that of the odometry, and its standard error
 
 
 def backward_wheel(log: Log) -> str:
@@ -80,3 +86,67 @@ def _side(own: np.ndarray, reference: np.ndarray, half: float, least: float, com
     if commands and gains[0] > 0 and exchanged_off < turned_off:
         return ""
     return "left" if gains[0] > 0 else "right"
+
+
+def wrong_sizes(trials: Sequence[Trial], spec: VehicleSpec, reach: float) -> list[str]:
+    """Sentences on a wheel radius and a track that are further off than is usual.
+
+    Whether these are wrong or the odometry has a scale of its own, the outside pose does not show; a ruler does.
+    `reach`: how far from the axle's centre a tracked point may be [m].
+    """
+    each = [_odometry_gains(trial, reach) for trial in trials]
+    way, turn = (_pooled([one[k] for one in each]) for k in (0, 1))
+    if spec.drive == "skid":
+        turn = None  # it scrubs in turns
+    found = []
+    if way is not None:
+        found.append(f"ground_truth: it goes {_times(way)} as far as the odometry says: the wheel radius is then "
+                     f"{spec.wheel_radius * way[0]:.3g} m, not {spec.wheel_radius:.3g} m, or the odometry has a scale "
+                     "of its own. Measure the wheels; a fit finds both.")
+    across = None if turn is None else spec.track * (1.0 if way is None else way[0]) / turn[0]
+    if turn is not None and across is not None and abs(np.log(across / spec.track)) > USUAL:
+        found.append(f"ground_truth: it turns {_times(turn)} as far as the odometry says: the track is then "
+                     f"{across:.3g} m, not {spec.track:.3g} m, or the odometry has a scale of its own. Measure the "
+                     "track; a fit finds both.")
+    return found
+
+
+def _times(gain: Gain) -> str:
+    return f"{gain[0]:.3f} times ({gain[0] - 2 * gain[1]:.3f} to {gain[0] + 2 * gain[1]:.3f})"
+
+
+def _odometry_gains(trial: Trial, reach: float) -> tuple[Gain | None, Gain | None]:
+    """Of a trial's way and of its turns; None for what it does not show."""
+    pose = trial.ground_truth
+    if pose is None or trial.odometry is None:
+        return None, None
+    late = [shift.delay for shift in clock_shift(trial).values()]
+    on_time = replace(trial, ground_truth=replace(pose, t=pose.t - (float(np.median(late)) if late else 0.0)))
+    motion = motion_of(on_time, "ground_truth")
+    if motion is None:
+        return None, None
+    along = direction(motion, reach)
+    sure = along.explained > WHOLE and np.isfinite(along.gain_error)
+    way = (along.gain, along.gain_error) if sure else None
+    power = float(motion.omega @ motion.omega)
+    if motion.omega.std() < VARIED:
+        return way, None
+    gain = float(motion.turn @ motion.omega) / power
+    left = motion.turn - gain * motion.omega
+    explained = 1 - float(left @ left) / max(float(motion.turn @ motion.turn), 1e-12)
+    error = float(np.sqrt(left @ left / max(len(left) * GRID_DT / APART, 1.0) / power))
+    return way, (gain, error) if explained > WHOLE else None
+
+
+def _pooled(found: Sequence[Gain | None]) -> Gain | None:
+    """The gain of all trials together, where it is surely further from 1 than is usual."""
+    known = [one for one in found if one is not None]
+    if not known:
+        return None
+    gains, errors = np.array(known).T
+    weights = 1 / np.maximum(errors, 1e-4) ** 2
+    gain = float((weights * gains).sum() / weights.sum())
+    scatter = float((weights * (gains - gain) ** 2).sum() / weights.sum() / max(len(known) - 1, 1))
+    error = float(np.sqrt(max(1 / weights.sum(), scatter)))
+    sure = gain > SURE * error and abs(np.log(gain)) > max(USUAL, SURE * error / gain)
+    return (gain, error) if sure else None
