@@ -4,6 +4,8 @@ It is the time from the last command to half of the speed, less that from a comm
 the vehicle responds equally late to both.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

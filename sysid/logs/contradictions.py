@@ -4,6 +4,8 @@ and poses that no vehicle drives: jumps from row to row, rows that stand still, 
 Clocks are compared by rates of turning and of motion, since no frame changes them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Recordings to driving-log datasets: the drives of bags, tables and measured sets, written as trials."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Container, Sequence
 from dataclasses import replace

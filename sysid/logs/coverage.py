@@ -1,5 +1,7 @@
 """What a log excites, how well its drives repeat, and what therefore no fit can find in it."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

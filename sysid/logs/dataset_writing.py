@@ -1,5 +1,7 @@
 """Trials written into a dataset folder: those that the loader accepts, at once, and never over others."""
 
+from __future__ import annotations
+
 import os
 import shutil
 from collections.abc import Container, Mapping, Sequence

@@ -4,6 +4,8 @@ It moves forward by v, and to the left and ahead by what a turn adds at a point 
 omega shows the angle between the pose's x axis and the way it travels.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

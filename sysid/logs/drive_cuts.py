@@ -1,5 +1,7 @@
 """Drives cut out of recordings: whole, or between standstills, each on a clock of its own."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,6 +5,8 @@ how late they turn and drive, and how far they fall short. No outside pose is ne
 same are many, and a log determines their sum only: scrub, slip or a wider track. Block jackknife: Kuensch (1989).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """A yaw rate measured on the vehicle: its sign, by the yaw of an outside pose or of the odometry."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

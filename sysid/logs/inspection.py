@@ -1,5 +1,7 @@
 """What a driving log holds: regularity of its streams, clocks, excitation, and what no fit can identify from it."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any

@@ -11,6 +11,8 @@ A drive is an episode. Its commands are `action`, its odometry `observation.stat
 frame, and measurements are interpolated. Version 2 is read as well; it has one file for each episode.
 """
 
+from __future__ import annotations
+
 import json
 import re
 from collections import Counter

@@ -4,6 +4,8 @@ Every stream keeps its own clock, as real logs do. All quantities are SI, yaw is
 reference point: the centre of the driven axle (the vehicle's centre for skid drive).
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

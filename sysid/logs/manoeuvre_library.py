@@ -4,6 +4,8 @@ All begin and end with a second of standstill. Those of `whill_mjx.logs.manoeuvr
 pseudo-random steps, chirps, ladders of step sizes, stop and go, slow yaw, and a square along four headings.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

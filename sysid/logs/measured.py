@@ -1,5 +1,7 @@
 """One loader of all logs that a fit can read: datasets, and two published measured sets in their original form."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -5,6 +5,8 @@ Frames: the simulation starts at the measured start pose in the room frame, whic
 are scored apart: a vehicle whose wheels slip has two different motions.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

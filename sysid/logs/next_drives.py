@@ -3,6 +3,8 @@
 They are scripts, `t,v,omega` as in command.csv, for `bridge.manoeuvre`. No vehicle model is asked.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,6 +4,8 @@ A row's stamp is up to a frame later than what it says: at 1 m/s and 20 ms, 2 cm
 row they show in steady driving, as uneven steps. Ages that all rows share do not; a fit has `sensor_delay` for them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

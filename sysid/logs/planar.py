@@ -1,5 +1,7 @@
 """Motion in the plane: headings of quaternions, poses in other frames, speeds of poses, and what speeds add up to."""
 
+from __future__ import annotations
+
 import numpy as np
 
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds

@@ -5,6 +5,8 @@ found from whole drives. A gyro settles it. The odometry shows the wheels, and a
 late pose: the delay then has to beat a first-order lag. Before a drive the vehicle went on as in its first instant.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -3,6 +3,8 @@
 A dataset's commands repeat exactly. A bag's never do: it begins at another moment, and messages come early or late.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

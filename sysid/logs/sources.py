@@ -1,5 +1,7 @@
 """What a path holds, and which command takes it: for the messages of commands that were given something else."""
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 

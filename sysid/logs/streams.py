@@ -4,6 +4,8 @@ Offsets come from shifting one signal against the other. Between command and mot
 response, is fitted with the shift; the rest is clock offset and transport delay, which no drive can separate.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

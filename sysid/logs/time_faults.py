@@ -1,5 +1,7 @@
 """Signs that the time of a log went wrong: rows in bursts, and a clock that was set forward in the drive."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,6 +6,8 @@ it is and with whatever factor a gyro may have. A vehicle stands though commande
 emergency stop was pressed, its motors were off or its wheels blocked.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

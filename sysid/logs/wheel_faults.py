@@ -5,6 +5,8 @@ and 2 v / track; negating the right one turns them into the negatives of these. 
 pose goes or turns further than the odometry, which uses them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -3,6 +3,8 @@
 Over minutes an open-loop replay drifts by more than any parameter moves it, and a single drive shows no noise.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -4,6 +4,8 @@ A clock may be set in the middle of a recording, and messages may come in bursts
 their times, so a clock that was set back shows only against the header stamps.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np

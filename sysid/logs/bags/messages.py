@@ -1,5 +1,7 @@
 """The numbers of one message."""
 
+from __future__ import annotations
+
 import math
 from typing import Any
 

@@ -6,6 +6,8 @@ PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and
 no pose, the transforms between frames (TFMessage) are chained to one.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,5 +1,7 @@
 """One recording: where it is, its streams, and the topics and types that hold them."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Which topic is which stream: by name, by type, or as the caller says."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -4,6 +4,8 @@ A pose in `odom` is odometry. One in `map`, `world` or another fixed frame is an
 against their direction, as where a lidar odometry publishes `odom` as a child of the base.
 """
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

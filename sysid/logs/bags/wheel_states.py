@@ -4,6 +4,8 @@ The chair's state (whill_msgs/ModelCr2State, 2 to 20 Hz, no header) has motor an
 filtered speeds in km/h, and a right motor that counts down forward. At 2 Hz the speeds say which whole turn it was.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

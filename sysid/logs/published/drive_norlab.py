@@ -6,6 +6,8 @@ mean of its first five yaws but counted yaw from the first one; and an ICP updat
 neither.
 """
 
+from __future__ import annotations
+
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,6 +1,8 @@
 """The MRCLAM set, five iRobot Create and motion capture: UTIAS Multi-Robot Cooperative Localization and Mapping (Leung
 et al., IJRR 2011, asrl.utias.utoronto.ca/datasets/mrclam)."""
 
+from __future__ import annotations
+
 import io
 import warnings
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """What the published sets share: poses that hold between updates, and limits of what is read."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from sysid.logs.records import PoseStream

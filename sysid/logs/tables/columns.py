@@ -1,5 +1,7 @@
 """A table of numbers, and what one of its columns holds: a role, and a unit with its size in SI."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

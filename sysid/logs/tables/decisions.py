@@ -1,5 +1,7 @@
 """What the columns of a drive hold: as the user said, as guessed, and as answered on a terminal."""
 
+from __future__ import annotations
+
 import re
 import sys
 from collections.abc import Mapping, Sequence

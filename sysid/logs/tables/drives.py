@@ -1,5 +1,7 @@
 """Drives out of somebody else's CSV and TUM files: which columns they have, joined by time, in SI units."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,6 +4,8 @@ A role is STREAM.QUANTITY, such as command.v or ground_truth.yaw; "time" is that
 from the name where it is there, else from the numbers.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

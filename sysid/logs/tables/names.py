@@ -4,6 +4,8 @@ Names are those of ROS exports (`pose.pose.position.x`), of plotting programs (`
 people (`cmd_v [km/h]`).
 """
 
+from __future__ import annotations
+
 import re
 
 import numpy as np

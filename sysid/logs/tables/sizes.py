@@ -1,5 +1,7 @@
 """Units that numbers show: a speed must be the rate of its pose, a measured speed about the commanded one."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

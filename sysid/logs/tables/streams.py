@@ -1,5 +1,7 @@
 """Streams out of tables: rows in order of time, in SI units, as v and omega and as a pose."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

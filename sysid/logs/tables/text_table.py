@@ -4,6 +4,8 @@ Names are above the numbers, in comments, in several lines, or nowhere. Cells ma
 thousands, dates and times of day.
 """
 
+from __future__ import annotations
+
 import csv
 import re
 from collections import Counter
