@@ -123,8 +123,8 @@ def _missing(robot: Robot, check: Check) -> list[str]:
         found.append(f"the driven wheels carry {carried:.0%} of the weight: they may spin. Check the heights of "
                      "casters and wheels, and the centre of mass")
     if check.explodes:
-        found.append("it explodes in a trial drive: a servo is too stiff for its wheel, or contacts are, at this "
-                     "timestep. Take a smaller timestep or gain")
+        found.append("it explodes in a trial drive: a servo is too stiff for its wheel where it slips, or a contact "
+                     "is. Take a smaller timestep or gain, or the integrator implicitfast")
     elif robot.falls:
         found.append(f"{FALLS}. No fit takes it so")
     elif check.speed < -STRAIGHT * check.command[0]:

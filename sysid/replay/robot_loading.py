@@ -185,16 +185,11 @@ def _drive(draft: _Draft, radius: float, regulated: bool) -> list[int]:
     inertias = [wheel_inertias(host, one, radius, len(joints)) for one in draft.ids]
     bare, notes = add_servos(draft.path, spec, joints, inertias)
     draft.notes += notes
-    stable, explicit = is_stable(host, joints, inertias), mujoco.mjtIntegrator.mjINT_EULER
-    if not stable and spec.option.integrator == explicit:
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        draft.notes.append(f"{draft.path.name}: the servos of its wheels are too stiff for the timestep where a wheel "
-                           "slips: integrator implicitfast stands in for Euler")
-    if regulated and stable:
-        spec.option.integrator = explicit
+    if regulated and is_stable(host, joints, inertias):
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     if regulated:
         regulate(spec, host, joints, inertias, radius)
-    if bare or regulated or not stable:
+    if bare or regulated:
         draft.compile()
     return bare
 

@@ -179,18 +179,13 @@ def test_a_robot_that_drives_backwards_is_named(tmp_path):
     assert not any("it drives backwards" in line for line in describe_robot(robot, check))
 
 
-def test_servos_that_are_too_stiff_for_wheels_that_slip_are_integrated_implicitly(tmp_path):
-    path = cart_file(tmp_path, '<velocity joint="{}" kv="3"/>')
-    text = path.read_text().replace(' integrator="implicitfast"', "").replace('size="0.1" mass="0.5"',
-                                                                            'size="0.1" mass="0.1"')
-    path.write_text(text.replace('friction="0.01" priority="1"', 'friction="0.01" priority="2"').replace(
-        '<geom type="plane" size="5 5 0.1"/>', '<geom type="plane" size="5 5 0.1" friction="0.01" priority="1"/>'))
-    robot = load_robot(path)
-    assert sum("integrator implicitfast stands in for Euler" in note for note in robot.notes) == 1
+def test_a_robot_that_explodes_in_a_trial_drive_is_named(tmp_path):
+    robot = load_robot(cart_file(tmp_path, SERVOS[1]))
     check = check_robot(robot)
     assert not check.explodes
-    lines = describe_robot(robot, replace(check, explodes=True))
-    assert any("it explodes in a trial drive" in line for line in lines)
+    lost = replace(check, explodes=True)
+    assert not lost.drives_straight
+    assert any("it explodes in a trial drive" in line for line in describe_robot(robot, lost))
 
 
 def test_the_floor_that_is_added_lies_under_the_wheels_wherever_their_bodies_begin(tmp_path):
