@@ -96,14 +96,15 @@ def vehicle_of(
 def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     """The vehicle of the simulator that a skid-steered robot's file describes, where a fit begins.
 
-    It has four wheels: more are taken for four at the distance from the middle that resists turning as much, the root
-    mean square of theirs.
+    Wheels between the outer axles are taken to stand in the middle of these (`middle_wheels`): as large a share of the
+    weight as gives all wheels their mean square distance from there.
 
     `spec`: of the log, with stated sizes and limits.
     """
     host = robot.host
     axles = _ahead(robot, robot.resting.xanchor[list(robot.joints)])
-    half = round(float(np.sqrt(np.square(axles - axles.mean()).mean())), 6)
+    half = round(float(np.ptp(axles)) / 2, 6)
+    share = 1 - float(np.var(axles)) / half**2 if len(axles) > 4 else 0.0
     mass, com, yaw_inertia = _mass_of(robot, {})
     low, high = extent_of(robot)
     length, width, height = (high - low).tolist()
@@ -113,8 +114,8 @@ def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     spec = replace(spec, mass=mass, drive="skid", wheelbase=2 * half, rear_axle_x=-half - float(low[0] + high[0]) / 2,
                    wheel_inertia=wheels * spin, body_length=length, body_width=width, body_height=height)
     found = {"body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
-             "body.com_y": com[1], "body.com_z": com[2]}
-    params = in_short(spec, "physical")
+             "body.com_y": com[1], "body.com_z": com[2], **({"middle_wheels.share": share} if share else {})}
+    params = with_effects(in_short(spec, "physical"), ("middle_wheels",) if share else ())
     return Twin(spec, set_values(params, list(found), jnp.asarray(list(found.values()), jnp.result_type(float))), {})
 
 
