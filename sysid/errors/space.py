@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid.replay.arrays import namespace
 from whill_mjx.io.fields import growth, parameter_field
-from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec
 from whill_mjx.vehicle.types import Parameter
 
 STEP = 0.01  # half the distance between the two ends of a difference, as a share of the parameter's range
@@ -26,6 +26,7 @@ FIXED = {
     "rolling_contact.grip": "part of the model, not of the vehicle",
     "body.mass": "acts only as a ratio to forces that are fitted; weigh the vehicle",
     "body.com_z": "has next to no effect on level ground",
+    "middle_wheels.share": "follows from the places of the axles",
 }
 NUISANCE = {
     "torque_drive.period": "this log cannot determine it; it is free so that it does not bias the others",
@@ -152,6 +153,9 @@ class Space:
 FACTORS = {"body.yaw_inertia": (1 / 4, 4.0), "torque_drive.kp": (1 / 30, 30.0), "torque_drive.ki": (0.0, 20.0),
            "torque_drive.limit": (1 / 10, 30.0)}
 ROUNDING = 1e-6  # share by which single precision may round a bound out of what a file may hold
+LENGTHS = {"caster_kick.trail": "wheelbase", "payload_shift.x": "wheelbase", "payload_shift.y": "track",
+           "payload_shift.z": "body_height"}
+"""Lengths on the vehicle, and the size of the vehicle with which they grow."""
 LOSS = 1.5  # 1/s by which bearings may brake a vehicle that rolls, or a feed-forward make up for it
 
 
@@ -212,6 +216,8 @@ def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = Non
 def _in_proportion(name: str, about: Parameter, spec: VehicleSpec) -> tuple[float, float]:
     """Described bounds of a parameter, times as much as it grows with the vehicle, within what a file may hold."""
     times = growth(about.unit, spec.mass, spec.wheel_radius)
+    if name in LENGTHS:
+        times = getattr(spec, LENGTHS[name]) / getattr(WHILL_CR, LENGTHS[name])
     if times == 1.0:
         return about.low, about.high
     file = parameter_field(name, about.unit, about.low, about.high, about.neutral, (spec.mass, spec.wheel_radius))

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.effects import EFFECTS, Effect, make_effects
 from whill_mjx.effects.base import place_of
 from whill_mjx.effects.card import Axis, Falsifier, Scale
-from whill_mjx.vehicle.parameters import describe, get_values
+from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
@@ -64,7 +65,7 @@ class Hypothesis:
                 found[axis.parameter] = start * float(np.exp(axis.unit * size))
             elif axis.form == "moment":
                 mass = max(found[self.axes[0].parameter], 1e-3)
-                found[axis.parameter] = float(np.clip(axis.unit * size / mass, -0.6, 0.6))
+                found[axis.parameter] = float(np.clip(axis.unit * size / mass, -axis.reach, axis.reach))
             elif axis.form == "along":
                 found[axis.parameter] = start + axis.unit * size * float(q[0])
             else:
@@ -128,10 +129,14 @@ def _around_fit(one: Hypothesis) -> Hypothesis:
 
 
 def with_catalogue(params: VehicleParams, found: tuple[Hypothesis, ...]) -> VehicleParams:
-    """The vehicle with every effect of the hypotheses at its neutral values, which do not change its motion."""
+    """The vehicle with every effect of the hypotheses at values that do not change its motion: its neutral ones, and
+    sizes in proportion to the vehicle (`Axis.start`)."""
     have = {effect.name for effect in params.effects}
     added = {axis.parameter.partition(".")[0] for one in found for axis in one.axes} - have - {"body"}
-    return VehicleParams(params.body, (*params.effects, *make_effects(added)))
+    sizes = {axis.parameter: axis.start for one in found for axis in one.axes
+             if axis.start is not None and axis.parameter.partition(".")[0] in added}
+    full = VehicleParams(params.body, (*params.effects, *make_effects(added)))
+    return set_values(full, list(sizes), jnp.asarray(list(sizes.values()), jnp.result_type(float)))
 
 
 def base_values(params: VehicleParams) -> dict[str, float]:

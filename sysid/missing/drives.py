@@ -16,7 +16,7 @@ from sysid.errors.features import Features, bin_width, make_features
 from sysid.errors.noise import BIN_SHIFT, roughness
 from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
-from sysid.replay.arrays import Quotients
+from sysid.replay.arrays import Quotients, moved
 from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.records import ODOMETRY, POSE, TURN, Batch, FreeVehicle, Measured, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
@@ -105,7 +105,10 @@ class Drives:
 
         def seen(each: tuple[np.ndarray, np.ndarray]) -> Simulated:
             paths, mine = each
-            return self._sampled(_moved(paths[mine], first, start) if len(paths) < len(mine) else paths, every)
+            if len(paths) < len(mine):
+                poses = moved(paths[mine][..., POSE], first[:, None], start[:, None])
+                paths = np.concatenate([poses, paths[mine][..., POSE.stop :]], axis=-1)
+            return self._sampled(paths, every)
 
         return jax.tree.map(lambda *leaves: np.stack(leaves), *on_all_cores(seen, self._paths(values)))
 
@@ -225,15 +228,6 @@ def without_gyro(trials: tuple[Trial, ...]) -> tuple[Trial, ...]:
 def rows_of_call(most: int = CHUNK) -> int:
     """Drives of one replay call, on a processor at most so many."""
     return min(CHUNK, most) if on_processor() else ACCELERATED
-
-
-def _moved(paths: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Paths (B, R + 1, 9) moved in the room from starts (B, 5) to other ones; odometry and speeds stay."""
-    turn = (after[:, 2] - before[:, 2])[:, None]
-    x, y = paths[..., 0] - before[:, :1], paths[..., 1] - before[:, 1:2]
-    cos, sin = np.cos(turn), np.sin(turn)
-    x, y = after[:, :1] + cos * x - sin * y, after[:, 1:2] + sin * x + cos * y
-    return np.concatenate([np.stack([x, y, paths[..., 2] + turn], axis=-1), paths[..., 3:]], axis=-1)
 
 
 def _courses(batch: Batch, room: tuple[tuple[int, float], ...], shared: bool) -> Courses:

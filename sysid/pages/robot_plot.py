@@ -20,10 +20,7 @@ def write_robot(path: Path, robot: Robot, loads: dict[str, float]) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    host, data = robot.host, mujoco.MjData(robot.host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(host, data)
-    joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+    host, data, joints = robot.host, robot.resting, robot.joints
     wheels = {int(host.body_weldid[host.jnt_bodyid[joint]]) for joint in joints}
     figure, axes = plt.subplots(1, 2, figsize=(10, 5), constrained_layout=True)
     for geom in range(host.ngeom):

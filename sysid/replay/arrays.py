@@ -31,6 +31,15 @@ def rotated(quaternion: Any, vector: Any) -> Any:
     return vector + quaternion[..., :1] * cross + np_.cross(quaternion[..., 1:], cross)
 
 
+def moved(poses: Any, before: Any, after: Any) -> Any:
+    """Poses (..., 3) of x, y, yaw after the planar motion that brings a pose `before` (..., 3) to `after`."""
+    xp, turn = namespace(poses), after[..., 2] - before[..., 2]
+    cos, sin = xp.cos(turn), xp.sin(turn)
+    x, y, yaw = (poses[..., i] - before[..., i] for i in range(3))
+    return xp.stack([after[..., 0] + cos * x - sin * y, after[..., 1] + sin * x + cos * y, after[..., 2] + yaw],
+                    axis=-1)
+
+
 def quaternion_product(a: jax.Array, b: jax.Array) -> jax.Array:
     """Rotation b, then a (w, x, y, z)."""
     return jnp.stack([

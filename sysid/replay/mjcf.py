@@ -88,6 +88,10 @@ def mjcf_model(
     robot = load_robot(Path(path), wheels, wheel_radius, track, timestep, regulated=calibrate)
     if robot.falls:
         raise ValueError(f"{path}: {FALLS}.")
+    if robot.askew:
+        raise ValueError(f"{path}: the axis of {', '.join(robot.askew)} does not lie across the vehicle, so its wheels "
+                         "do not roll ahead. Correct the axis in the file, or name the wheels that drive with "
+                         "--wheels.")
     host = robot.host
     bounds, entries = _searched(robot, parameters, calibrate)
     # A mass scales its inertia: before an inertia is set by itself.

@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sysid.replay.arrays import moved
 from sysid.replay.delays import delay_apart, delayed
 from sysid.replay.one_drive import from_reference, simulate_one
-from sysid.replay.records import Batch, Plant, Simulated
+from sysid.replay.records import POSE, Batch, Plant, Simulated
 
 FEW, MANY = 4, 32
 """Parameter sets whose commands and readings are computed together: each other number would be compiled."""
@@ -47,7 +48,8 @@ class HostReplay:
         def after(values: jax.Array, one: Batch, motion: jax.Array) -> Simulated:
             params = set_values(values)
             start = from_reference(params, one.start)
-            motion = motion if params.room_fixed else _moved(motion, start)
+            if not params.room_fixed:  # it was driven from the origin
+                motion = motion.at[:, POSE].set(moved(motion[:, POSE], jnp.zeros(3), start))
             kept = tuple(effect for effect in params.effects if not hasattr(effect, "command"))
             motion = motion.reshape(*one.command.shape[:2], -1)
             return simulate_one(recorded, replace(params, effects=kept), replace(one, command=motion, warm_up=0))
@@ -98,11 +100,3 @@ def _in_blocks(function: Callable[..., Any], *arrays: np.ndarray) -> Any:
         block = function(*(jnp.asarray(one, jnp.result_type(float)) for one in filled))
         found.append(jax.tree.map(lambda leaf, kept=size - missing: np.asarray(leaf)[:kept], block))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
-
-
-def _moved(motion: jax.Array, start: jax.Array) -> jax.Array:
-    """Motion (S, 6) from the origin, from a start (5,)."""
-    cos, sin = jnp.cos(start[2]), jnp.sin(start[2])
-    x, y = motion[:, 0], motion[:, 1]
-    pose = [start[0] + cos * x - sin * y, start[1] + sin * x + cos * y, start[2] + motion[:, 2]]
-    return jnp.concatenate([jnp.stack(pose, axis=-1), motion[:, 3:]], axis=-1)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+
+ACROSS = 0.5  # of an axis across the vehicle, below which a wheel does not roll ahead
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,31 @@ class Robot:
     def joints(self) -> tuple[int, ...]:
         """Those of the driven wheels."""
         return tuple(int(self.host.dof_jntid[wheel]) for wheel in self.wheels)
+
+    @property
+    def askew(self) -> tuple[str, ...]:
+        """Driven joints whose axes do not lie across the vehicle: their wheels do not roll ahead."""
+        return tuple(self.host.joint(one).name for one in self.joints
+                     if abs(float(self.resting.xaxis[one] @ self.axes[1])) < ACROSS)
+
+    @property
+    def base(self) -> int:
+        """Body that moves freely."""
+        return int(self.host.body_rootid[self.host.jnt_bodyid[self.joints[0]]])
+
+    @cached_property
+    def resting(self) -> mujoco.MjData:
+        """Where everything is at rest; not to be changed."""
+        data = mujoco.MjData(self.host)
+        data.qpos[:] = self.rest
+        mujoco.mj_forward(self.host, data)
+        return data
+
+    @property
+    def axes(self) -> np.ndarray:
+        """(3, 3) ahead, to the left and up at rest, in the room."""
+        ahead = self.resting.xmat[self.base].reshape(3, 3) @ self.forward
+        return np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
 
     @property
     def units(self) -> np.ndarray:

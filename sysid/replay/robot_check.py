@@ -17,7 +17,6 @@ DRAGS = 0.3  # friction of what slides on the floor: a ball or a skid of plastic
 STRAIGHT = 0.1  # share by which the speed may differ from the command
 TURNS = 0.75  # share of the commanded rate on the spot, below which something keeps a robot from turning
 DENSE = 20_000.0  # kg/m^3, of the box around a robot: gold
-ACROSS = 0.5  # of an axis across the vehicle, below which a wheel does not roll ahead
 ALIKE = 0.01  # share by which radii of wheels may differ
 LIGHT = 0.02  # share of the weight below which what touches the floor is not listed
 
@@ -31,12 +30,13 @@ class Check:
     speed: float  # along the vehicle where it should drive straight [m/s]
     drift: float  # yaw rate there [rad/s]
     rate: float  # yaw rate where it should turn on the spot [rad/s]
+    explodes: bool = False  # whether a speed or place is no longer finite in one of both drives
 
     @property
     def drives_straight(self) -> bool:
         """Whether it drives within a tenth of the commanded speed, and hardly turns meanwhile."""
         v = self.command[0]
-        return abs(self.speed - v) <= STRAIGHT * v and abs(self.drift) * (SECONDS - 1) < 0.2
+        return not self.explodes and abs(self.speed - v) <= STRAIGHT * v and abs(self.drift) * (SECONDS - 1) < 0.2
 
 
 def check_robot(robot: Robot) -> Check:
@@ -50,28 +50,26 @@ def check_robot(robot: Robot) -> Check:
     rest = np.tile(robot.rest, (1, 2, 1))
     states = SimpleNamespace(qpos=rest, qvel=np.zeros((1, 2, robot.host.nv)))
     values = {"drive.kp": np.array([robot.drive_gain[0]])} if robot.motors else {}
-    straight, spot = RobotDrive(robot, {})(values, states, commands, 0, np.zeros((1, 2, 3)))[0]
+    seen = RobotDrive(robot, {})(values, states, commands, 0, np.zeros((1, 2, 3)))[0]
+    straight, spot = seen
     yaw = np.unwrap(straight[:, 2])
     step = np.diff(straight[second:, :2], axis=0)
     forward = (step[:, 0] * np.cos(yaw[second:-1]) + step[:, 1] * np.sin(yaw[second:-1])).sum()
     turned = np.unwrap(spot[:, 2])
     took = SECONDS - 1
     return Check(_loads(robot), (v, omega), float(forward / took), float((yaw[-1] - yaw[second]) / took),
-                 float((turned[-1] - turned[second]) / took))
+                 float((turned[-1] - turned[second]) / took), bool(seen[..., 5].any()))
 
 
 def _loads(robot: Robot) -> dict[str, float]:
     """Share of the weight on each geom that touches the floor at rest, the largest first."""
-    host, data = robot.host, mujoco.MjData(robot.host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_forward(host, data)
-    root = host.body_rootid[host.jnt_bodyid[robot.joints[0]]]
+    host, data = robot.host, robot.resting
     found: dict[str, float] = {}
     force = np.zeros(6)
     for number in range(data.ncon):
         contact = data.contact[number]
         ours = [int(geom) for geom in (contact.geom1, contact.geom2) if host.geom_bodyid[geom] != 0]
-        if len(ours) != 1 or host.body_rootid[host.geom_bodyid[ours[0]]] != root:
+        if len(ours) != 1 or host.body_rootid[host.geom_bodyid[ours[0]]] != robot.base:
             continue
         mujoco.mj_contactForce(host, data, number, force)
         name = host.geom(ours[0]).name or f"geom {ours[0]}"
@@ -83,19 +81,14 @@ def _loads(robot: Robot) -> dict[str, float]:
 def describe_robot(robot: Robot, check: Check) -> list[str]:
     """What was understood, as lines of text."""
     host = robot.host
-    data = mujoco.MjData(host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(host, data)
     count, half = len(robot.wheels), len(robot.wheels) // 2
     kind = "differential drive, two driven wheels" if count == 2 else f"skid-steered, {count} driven wheels"
-    root = int(host.body_rootid[host.jnt_bodyid[_joints(robot)[0]]])
-    lines = [f"{robot.path.name}: {kind}, {float(host.body_subtreemass[root]):.4g} kg",
+    lines = [f"{robot.path.name}: {kind}, {float(host.body_subtreemass[robot.base]):.4g} kg",
              f"  wheel radius {robot.wheel_radius:.4g} m, track {robot.distance:.4g} m"]
     if count > 2:
-        ahead = (data.xanchor[_joints(robot)] - data.xpos[root]) @ _forward(robot, data, root)
-        lines[-1] += f", wheelbase {np.ptp(ahead):.4g} m"
-    names = [host.joint(joint).name for joint in _joints(robot)]
-    lines += [f"  left: {', '.join(names[:half])}; right: {', '.join(names[half:])}",
+        lines[-1] += f", wheelbase {np.ptp(robot.resting.xanchor[list(robot.joints)] @ robot.axes[0]):.4g} m"
+    names = [host.joint(joint).name for joint in robot.joints]
+    lines += [f"  left: {', '.join(names[:half])}; right: {', '.join(names[half:])}; front: {_front(robot)}",
               f"  driven by {_drive(robot)}"]
     lines += ["", "On the floor, at rest"]
     lines += [f"  {name}: {share:.0%} of the weight" for name, share in check.loads.items() if share >= LIGHT]
@@ -119,7 +112,7 @@ def _drive(robot: Robot) -> str:
 
 def _missing(robot: Robot, check: Check) -> list[str]:
     found = []
-    host, wheels = robot.host, set(np.array(robot.host.jnt_bodyid)[_joints(robot)].tolist())
+    host, wheels = robot.host, set(robot.host.jnt_bodyid[list(robot.joints)].tolist())
     carried = sum(share for name, share in check.loads.items()
                   if int(host.body_weldid[host.geom_bodyid[host.geom(name).id]]) in
                   {int(host.body_weldid[body]) for body in wheels})
@@ -129,7 +122,10 @@ def _missing(robot: Robot, check: Check) -> list[str]:
     if carried < 0.3:
         found.append(f"the driven wheels carry {carried:.0%} of the weight: they may spin. Check the heights of "
                      "casters and wheels, and the centre of mass")
-    if robot.falls:
+    if check.explodes:
+        found.append("it explodes in a trial drive: a servo is too stiff for its wheel where it slips, or a contact "
+                     "is. Take a smaller timestep or gain, or the integrator implicitfast")
+    elif robot.falls:
         found.append(f"{FALLS}. No fit takes it so")
     elif check.speed < -STRAIGHT * check.command[0]:
         found.append("it drives backwards: what turns its wheels pulls against the command. Check the signs of gear "
@@ -147,26 +143,18 @@ def _missing(robot: Robot, check: Check) -> list[str]:
 
 def _density(robot: Robot) -> float:
     """Mass over the volume of the box around a robot's geoms [kg/m^3]."""
-    host, data = robot.host, mujoco.MjData(robot.host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(host, data)
-    root = int(host.body_rootid[host.jnt_bodyid[_joints(robot)[0]]])
-    mine = host.body_rootid[host.geom_bodyid] == root
-    place, size = data.geom_xpos[mine], host.geom_rbound[mine, None]
+    host = robot.host
+    mine = host.body_rootid[host.geom_bodyid] == robot.base
+    place, size = robot.resting.geom_xpos[mine], host.geom_rbound[mine, None]
     volume = float(np.prod((place + size).max(0) - (place - size).min(0)))
-    return float(host.body_subtreemass[root]) / max(volume, 1e-12)
+    return float(host.body_subtreemass[robot.base]) / max(volume, 1e-12)
 
 
 def _limits(robot: Robot, v: float) -> list[str]:
     """What of the driven wheels' joints and actuators may keep a robot from a speed [m/s]."""
-    host, found = robot.host, []
-    data = mujoco.MjData(host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(host, data)
-    joints = _joints(robot)
-    across = np.cross([0.0, 0.0, 1.0], _forward(robot, data, int(host.body_rootid[host.jnt_bodyid[joints[0]]])))
-    found += [f"the axis of joint {host.joint(one).name} does not lie across the vehicle (URDF's default is 1 0 0)"
-              for one in joints if abs(float(data.xaxis[one] @ across)) < ACROSS]
+    host, joints = robot.host, robot.joints
+    found = [f"the axis of joint {name} does not lie across the vehicle (URDF's default is 1 0 0)"
+             for name in robot.askew]
     radii = [radius_of(robot.path, host, int(host.jnt_bodyid[one]), robot.wheel_radius) for one in joints]
     if max(radii) > (1 + ALIKE) * min(radii):
         found.append("the radii of its wheels differ: " + ", ".join(
@@ -177,7 +165,7 @@ def _limits(robot: Robot, v: float) -> list[str]:
                          "(effort, or actuatorfrcrange)")
     of_file = zip(robot.actuators, joints, robot.units, strict=True) if not robot.motors and not robot.added else ()
     for one, joint, unit in of_file:
-        called = host.actuator(one).name or f"of joint {host.joint(joint).name}"
+        called = host.actuator(one).name
         gain, damping = -host.actuator_biasprm[one, 2] * host.actuator_gear[one, 0] ** 2, host.dof_damping[
             host.jnt_dofadr[joint]]
         if damping > STRAIGHT * gain:
@@ -193,9 +181,7 @@ def _limits(robot: Robot, v: float) -> list[str]:
 
 def _drags(robot: Robot) -> list[str]:
     """What slides on the floor with so much friction that wheels pull against it."""
-    host, data = robot.host, mujoco.MjData(robot.host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_forward(host, data)
+    host, data = robot.host, robot.resting
     friction: dict[int, float] = {}
     for contact in data.contact[: data.ncon]:
         for geom in {int(contact.geom1), int(contact.geom2)} & set(robot.sliding):
@@ -207,7 +193,7 @@ def _drags(robot: Robot) -> list[str]:
 
 def _coupled(robot: Robot) -> str:
     """A sentence on driven wheels of both sides that a mimic joint lets turn only together; else empty."""
-    host, joints = robot.host, _joints(robot)
+    host, joints = robot.host, robot.joints
     for number in range(host.neq):
         ends = {int(host.eq_obj1id[number]), int(host.eq_obj2id[number])}
         if host.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT and ends == set(joints):
@@ -216,9 +202,7 @@ def _coupled(robot: Robot) -> str:
     return ""
 
 
-def _joints(robot: Robot) -> list[int]:
-    return [int(np.flatnonzero(robot.host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
-
-
-def _forward(robot: Robot, data: mujoco.MjData, root: int) -> np.ndarray:
-    return np.asarray(data.xmat[root].reshape(3, 3) @ robot.forward)
+def _front(robot: Robot) -> str:
+    """Which way it drives by its file, in the axes of the body that moves freely."""
+    axis = int(np.abs(robot.forward).argmax())
+    return ("+" if robot.forward[axis] > 0 else "-") + "xyz"[axis]

@@ -144,6 +144,13 @@ def as_round_wheels(path: Path, spec: Any, host: mujoco.MjModel, bodies: Sequenc
     return notes
 
 
+def lowest(host: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Height of the lowest point of a geom, or of the box around it [m]."""
+    up, half = data.geom_xmat[geom].reshape(3, 3)[2], host.geom_aabb[geom, 3:]
+    down = half[0] if int(host.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE) else np.abs(up) @ half
+    return float(data.geom_xpos[geom, 2] + up @ host.geom_aabb[geom, :3] - down)
+
+
 def below_wheels(
     path: Path, host: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int], radius: float,
 ) -> dict[str, str]:  # fmt: skip
@@ -155,10 +162,7 @@ def below_wheels(
         if host.geom_bodyid[geom] == 0 or int(host.body_weldid[host.geom_bodyid[geom]]) in wheels or not (
                 host.geom_contype[geom] | host.geom_conaffinity[geom]):
             continue
-        turn, reach = data.geom_xmat[geom].reshape(3, 3), host.geom_aabb[geom, 3:]
-        round_one = int(host.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE)
-        down = float(reach[0] if round_one else np.abs(turn[2]) @ reach)
-        low = floor - (float(data.geom_xpos[geom, 2] + turn[2] @ host.geom_aabb[geom, :3]) - down)
+        low = floor - lowest(host, data, geom)
         if low > DEEP * radius:
             name = host.geom(geom).name
             found[name] = (f"{path.name}: {name} reaches {low:.3g} m below the driven wheels: its contacts are left "

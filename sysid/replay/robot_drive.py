@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from sysid.replay.arrays import rotated
+from sysid.replay.arrays import moved, rotated
 from sysid.replay.cores import cores
 from sysid.replay.robot import Robot
 from sysid.replay.robot_parameters import Entry, Overlaid
@@ -53,7 +53,8 @@ class RobotDrive:
         path = path.reshape(sets, trials, steps, -1)
         seen = self.observe(path[..., place], path[..., speed])
         if warm_up:
-            seen = _from(seen, warm_up, starts)
+            before, seen = seen[:, :, warm_up - 1, None, :3], seen[:, :, warm_up:].copy()
+            seen[..., :3] = moved(seen[..., :3], before, starts[:, :, None])
         lost = ~(np.abs(seen) < LOST).all(-1)
         seen[lost] = 0.0
         return np.concatenate([seen, np.maximum.accumulate(lost, axis=2)[..., None]], axis=-1)
@@ -128,15 +129,3 @@ def _close_loop(model: mujoco.MjModel, nominal: mujoco.MjModel, robot: Robot, kp
                 limits = np.clip(limits, *nominal.actuator_forcerange[one])
             model.actuator_ctrllimited[one], model.actuator_forcelimited[one] = 0, 1
             model.actuator_forcerange[one] = limits
-
-
-def _from(seen: np.ndarray, first: int, starts: np.ndarray) -> np.ndarray:
-    """Motion (N, B, S, 5) from its step `first` on, moved so that it begins at the starts (N, B, 3)."""
-    turn = starts[..., 2, None] - seen[:, :, first - 1, None, 2]
-    cos, sin = np.cos(turn), np.sin(turn)
-    x, y = (seen[:, :, first:, i] - seen[:, :, first - 1, None, i] for i in range(2))
-    later = seen[:, :, first:].copy()
-    later[..., 0] = starts[..., 0, None] + cos * x - sin * y
-    later[..., 1] = starts[..., 1, None] + sin * x + cos * y
-    later[..., 2] += turn
-    return later

@@ -83,7 +83,8 @@ def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | Non
         included += _included(path.parent, path, top)
         return RobotFile(spec, [*left_out, *_place_meshes(path, spec)], included=tuple(included))
     drive = stated_drive(top)
-    notes = [*left_out, *complete_links(path, top), *_place_urdf_meshes(path, top, wheels, wheel_radius)]
+    notes = [*left_out, *complete_links(path, top),
+             *_place_urdf_meshes(path, top, wheels, wheel_radius or drive.radius)]
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode"))
     return RobotFile(spec, notes, _frictions(top), drive, tuple(included))
 

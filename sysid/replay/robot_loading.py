@@ -31,7 +31,8 @@ from sysid.replay.robot_servos import (
     regulate,
     wheel_inertias,
 )  # fmt: skip
-from sysid.replay.wheels import as_plain_wheels, swapped, wheel_joints
+from sysid.replay.stated_drive import StatedDrive
+from sysid.replay.wheels import as_plain_wheels, leftwards, swapped, turned_round, wheel_joints
 from whill_mjx.io.fields import Field, check
 
 TIMESTEP = Field("option timestep", "s", 1e-5, 0.1, remedy="Give the model an option timestep such as 0.002.")
@@ -40,6 +41,7 @@ WHEEL_RADIUS = Field("wheel radius", "m", 1e-3, 2.0,
 DISTANCE = Field("distance between the wheels", "m", 1e-3, 10.0,
                  remedy="Correct the places of these joints, or name other wheels with --wheels.")
 LIGHTEST = 0.5  # m/s^2 of gravity
+ALIKE = 0.01  # share by which two statements of one size may differ
 STIFF = 10.0  # of its friction over that of its contacts (impratio): wheels creep by 0.05 %, with 1 by 0.4 %
 SLIDING = 0.05  # friction of what a URDF lets slide on the floor: mostly the ball of a caster, without its bearing
 URDF_STEP = 0.0025  # s; a URDF states none
@@ -65,14 +67,13 @@ def load_robot(
                          "model.") from None
     host, data, ids = draft.host, draft.data, draft.ids
     body = int(host.body_rootid[draft.bodies[0]])
-    half = len(ids) // 2
     tyres = tyre_places(host, data, ids)
-    left = tyres[:half].mean(0) - tyres[half:].mean(0)
-    distance = float(np.linalg.norm(left))
+    left, distance = leftwards(path, draft.joints, tyres)
     check(str(path), DISTANCE, round(distance, 6), f"the distance between {' and '.join(draft.joints)}")
-    left = left / distance
     rotation = data.xmat[body].reshape(3, 3).copy()  # the data moves on
     middle = tyres.mean(0) - data.xpos[body]
+    forward = rotation.T @ np.cross(left, [0.0, 0.0, 1.0])
+    draft.notes += [*turned_round(path, draft.joints, float(forward[0])), *_other_sizes(draft, distance)]
     sign = tuple(float(np.sign(data.xaxis[one] @ left)) for one in ids)
     actuators = tuple(int(np.flatnonzero(host.actuator_trnid[:, 0] == one)[0]) for one in ids)
     free = int(host.body_jntadr[body])
@@ -82,10 +83,19 @@ def load_robot(
     spin, load = (float(one) for one in np.mean(inertias, axis=0))
     return Robot(path, draft.spec, host, root, speed, tuple(turning), actuators, sign,
                  are_motors(path, host, actuators), drive_gain(host, actuators, inertias), rotation.T @ middle,
-                 rotation.T @ np.cross(left, [0.0, 0.0, 1.0]), radius, distance if track is None else track,
+                 forward, radius, distance if track is None else track,
                  data.qpos.copy(), tuple(actuators[one] for one in bare), supports, distance, tuple(draft.notes),
                  integrals(host, ids), spin, load,
                  falls=len(ids) == 2 and falls(host, data.qpos.copy(), speed, body, rotation.T @ left))
+
+
+def _other_sizes(draft: _Draft, distance: float) -> list[str]:
+    """Notes on sizes that a plugin of the file takes, where its shapes have others."""
+    shapes = {"wheel radius": (draft.drive.radius, radius_of(draft.path, draft.host, draft.bodies[0], 0.0)),
+              "distance between the wheels": (draft.drive.track, distance)}
+    return [f"{draft.path.name}: a plugin takes {stated:.4g} m for the {name}, but its shapes have {own:.4g} m, which "
+            "counts here. What controller and odometry take is stated in dataset.toml"
+            for name, (stated, own) in shapes.items() if stated and own and abs(stated / own - 1) > ALIKE]
 
 
 def count_wheels(path: Path, wheels: Sequence[str] = ()) -> int:
@@ -106,6 +116,7 @@ class _Draft:
     joints: tuple[str, ...]  # of the driven wheels
     stated: dict[str, float] | None  # friction of links as a URDF states it for Gazebo; None for MJCF
     notes: list[str]
+    drive: StatedDrive  # what a URDF says of it
     host: mujoco.MjModel = field(init=False)
     data: mujoco.MjData = field(init=False)
 
@@ -147,7 +158,7 @@ def _read(path: Path, wheels: Sequence[str], wheel_radius: float | None, timeste
     if timestep is not None:
         spec.option.timestep = timestep
     check(str(path), TIMESTEP, float(spec.option.timestep))
-    draft = _Draft(path, spec, joints, stated, notes)
+    draft = _Draft(path, spec, joints, stated, notes, file.drive)
     draft.compile()
     if stated is not None and (rounded := as_round_wheels(path, spec, draft.host, draft.bodies)):
         notes += rounded
@@ -240,6 +251,12 @@ def _complete(path: Path, spec: Any, joints: Sequence[str]) -> None:
     elif top.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise ValueError(f"{path}: body {top.name!r} hangs on joint {top.joints[0].name!r}; a vehicle moves freely. "
                          "Give it a freejoint, or no joint.")
+    acting = {one.name for one in spec.actuators}
+    for one in spec.actuators:
+        if not one.name:
+            one.name = next(name for name in (one.target, *(f"{one.target}_{k}" for k in range(len(acting) + 1)))
+                            if name not in acting)
+            acting.add(one.name)
     for body in spec.bodies:
         taken = {geom.name for geom in spec.geoms}
         for k, geom in enumerate(body.geoms):

@@ -37,9 +37,8 @@ class OnlineRobot:
     def spec(self, base: VehicleSpec) -> VehicleSpec:
         """Sizes and outline of the robot; limits and camera are those of `base`, and the rest in proportion to it."""
         robot, (low, high) = self.robot, extent_of(self.robot)
-        body = robot.host.body_rootid[robot.host.jnt_bodyid[robot.joints[0]]]
         length, width, height = (high - low).tolist()
-        mass = float(robot.host.body_subtreemass[body])
+        mass = float(robot.host.body_subtreemass[robot.base])
         spec = in_proportion(base, robot.path.stem, robot.wheel_radius, robot.track, mass=mass)
         return replace(spec, drive="differential", driven_axle="rear", rear_axle_x=-float(low[0] + high[0]) / 2,
                        body_length=length, body_width=width, body_height=height, camera=base.camera)
@@ -84,8 +83,7 @@ class OnlineRobot:
         """(5,) x, y [m], yaw [rad], v [m/s], omega [rad/s] of the middle between the driven wheels now."""
         robot, data = self.robot, self._data
         x, y, yaw = self._drive.observe(data.qpos, data.qvel)[:3]
-        body = robot.host.body_rootid[robot.host.jnt_bodyid[robot.joints[0]]]
-        turn = data.xmat[body].reshape(3, 3) @ data.qvel[robot.speed + 3 : robot.speed + 6]
-        arm = data.xmat[body].reshape(3, 3) @ robot.point
+        attitude = data.xmat[robot.base].reshape(3, 3)
+        turn, arm = attitude @ data.qvel[robot.speed + 3 : robot.speed + 6], attitude @ robot.point
         velocity = data.qvel[robot.speed : robot.speed + 3] + np.cross(turn, arm)
         return np.array([x, y, yaw, math.cos(yaw) * velocity[0] + math.sin(yaw) * velocity[1], turn[2]])

@@ -142,10 +142,7 @@ def resolve(robot: Robot, path: str) -> Entry:
 
 def _upright(robot: Robot, body: int) -> int:
     """Principal axis of a body that is the most upright at rest."""
-    data = mujoco.MjData(robot.host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(robot.host, data)
-    return int(np.abs(data.ximat[body].reshape(3, 3)[2]).argmax())
+    return int(np.abs(robot.resting.ximat[body].reshape(3, 3)[2]).argmax())
 
 
 def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
@@ -158,7 +155,7 @@ def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
 def default_paths(robot: Robot) -> tuple[str, ...]:
     """Gain and damping of the driven wheels and friction of their tyres, each pair as one pattern where one fits."""
     host = robot.host
-    joints = [int(np.flatnonzero(host.jnt_dofadr == wheel)[0]) for wheel in robot.wheels]
+    joints = list(robot.joints)
     bodies = host.jnt_bodyid[joints]
     geoms = [max((int(one) for one in parts(host, body) if touches_ground(host, int(one))),
                  key=lambda one: host.geom_rbound[one], default=None) for body in bodies]
@@ -190,8 +187,7 @@ def _pattern(names: Sequence[str], known: Mapping[str, int]) -> str | None:
 def turning_inertia(robot: Robot) -> str:
     """Path of the inertia of the heaviest body: often a placeholder, with the rest of the controller's lag in it."""
     host = robot.host
-    root = host.body_rootid[host.jnt_bodyid[robot.joints[0]]]
-    heaviest = int(np.where(host.body_rootid == root, host.body_mass, 0.0).argmax())
+    heaviest = int(np.where(host.body_rootid == robot.base, host.body_mass, 0.0).argmax())
     return f"body.{host.body(heaviest).name}.inertia"
 
 

@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from sysid.replay.robot_contacts import lowest
+
 SETTLE = 1.0  # s in which the model comes to rest on the ground before it is driven
 REST_SPEED = 1.0  # m/s; a model that is faster after SETTLE falls, rolls away or shakes
 UPRIGHT = 0.9  # cosine of the angle between a hinge and the vertical, at least, of a caster's swivel
@@ -74,13 +76,9 @@ def near_floor(host: mujoco.MjModel, data: mujoco.MjData, root: int, reach: floa
     found = set(sliding(host, data, root))
     for geom in range(host.ngeom) if len(planes) else ():
         solid = bool(host.geom_contype[geom] | host.geom_conaffinity[geom])
-        if solid and int(host.body_weldid[host.geom_bodyid[geom]]) == root:
-            turn, half = data.geom_xmat[geom].reshape(3, 3)[2], host.geom_aabb[geom, 3:]
-            round_one = int(host.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_SPHERE)
-            low = data.geom_xpos[geom, 2] + turn @ host.geom_aabb[geom, :3] - (half[0] if round_one
-                                                                              else np.abs(turn) @ half)
-            if low - data.geom_xpos[planes, 2].max() < reach:
-                found.add(geom)
+        if solid and int(host.body_weldid[host.geom_bodyid[geom]]) == root and (
+                lowest(host, data, geom) - data.geom_xpos[planes, 2].max() < reach):
+            found.add(geom)
     return tuple(sorted(found))
 
 
@@ -101,7 +99,7 @@ def raise_supports(
     their load by the stiffness of contacts, where a real vehicle has springs or a gap."""
     axle = data.xpos[list(bodies)].mean(0)
     place = (data.geom_xpos[list(sliding)] - axle).reshape(-1, 3)
-    ahead = place @ data.xmat[host.body_rootid[bodies[0]]].reshape(3, 3)[:, 0]
+    ahead = place @ np.cross(data.xaxis[host.body_jntadr[bodies[0]]], [0.0, 0.0, 1.0])
     if not (ahead > 0).any() or not (ahead < 0).any():
         return []
     for geom, distance in zip(sliding, np.abs(ahead), strict=True):

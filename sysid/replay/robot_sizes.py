@@ -9,6 +9,7 @@ import jax
 import mujoco
 import numpy as np
 
+from sysid.replay.arrays import added
 from sysid.replay.robot import Robot
 from sysid.replay.robot_contacts import ROUND, parts, touches_ground, tyre_places
 
@@ -80,8 +81,5 @@ def sizes_of(robot: Robot, rolling: float = 1.0) -> dict[str, Size]:
 
 
 def _added(array: Any, index: Any, change: Any) -> Any:
-    if isinstance(array, jax.Array):
-        return array.at[index].add(change)
-    array = np.array(array)
-    array[index] += change
-    return array
+    """As `added`, with NumPy's array left as it is."""
+    return added(array if isinstance(array, jax.Array) else np.array(array), index, change)

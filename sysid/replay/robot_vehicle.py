@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from sysid.replay.models import Parameters, Twin, describe_parameters, with_effects
@@ -54,7 +53,7 @@ def vehicle_of(
     for name, entry in entries.items():
         arrays.update(entry.changes(Overlaid(robot.host, arrays), values[name]))
     mass, com, yaw_inertia = _mass_of(robot, arrays)
-    ahead = _ahead(robot, _rested(robot).geom_xpos[list(robot.sliding)])
+    ahead = _ahead(robot, robot.resting.geom_xpos[list(robot.sliding)])
     if ahead.min() < 0 < ahead.max():
         return "it stands on supports before and behind its axle"
     support = float(ahead.mean())
@@ -97,15 +96,15 @@ def vehicle_of(
 def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     """The vehicle of the simulator that a skid-steered robot's file describes, where a fit begins.
 
-    It has four wheels: more are taken for four at the distance from the middle that resists turning as much, the root
-    mean square of theirs.
+    Wheels between the outer axles are taken to stand in the middle of these (`middle_wheels`): as large a share of the
+    weight as gives all wheels their mean square distance from there.
 
     `spec`: of the log, with stated sizes and limits.
     """
     host = robot.host
-    data = _rested(robot)
-    axles = _ahead(robot, data.xanchor[list(robot.joints)])
-    half = round(float(np.sqrt(np.square(axles - axles.mean()).mean())), 6)
+    axles = _ahead(robot, robot.resting.xanchor[list(robot.joints)])
+    half = round(float(np.ptp(axles)) / 2, 6)
+    share = 1 - float(np.var(axles)) / half**2 if len(axles) > 4 else 0.0
     mass, com, yaw_inertia = _mass_of(robot, {})
     low, high = extent_of(robot)
     length, width, height = (high - low).tolist()
@@ -115,44 +114,24 @@ def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     spec = replace(spec, mass=mass, drive="skid", wheelbase=2 * half, rear_axle_x=-half - float(low[0] + high[0]) / 2,
                    wheel_inertia=wheels * spin, body_length=length, body_width=width, body_height=height)
     found = {"body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
-             "body.com_y": com[1], "body.com_z": com[2]}
-    params = set_values(in_short(spec, "physical"), list(found), jnp.asarray(list(found.values()),
-                                                                            jnp.result_type(float)))
-    return Twin(spec, params, {})
-
-
-def _rested(robot: Robot) -> Any:
-    data = mujoco.MjData(robot.host)
-    data.qpos[:] = robot.rest
-    mujoco.mj_kinematics(robot.host, data)
-    mujoco.mj_comPos(robot.host, data)
-    return data
-
-
-def _axes(robot: Robot, data: Any) -> np.ndarray:
-    """(3, 3) ahead, to the left and up, in the room."""
-    ahead = data.xmat[_root(robot)].reshape(3, 3) @ robot.forward
-    return np.stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
-
-
-def _root(robot: Robot) -> int:
-    return int(robot.host.body_rootid[robot.host.jnt_bodyid[robot.joints[0]]])
+             "body.com_y": com[1], "body.com_z": com[2], **({"middle_wheels.share": share} if share else {})}
+    params = with_effects(in_short(spec, "physical"), ("middle_wheels",) if share else ())
+    return Twin(spec, set_values(params, list(found), jnp.asarray(list(found.values()), jnp.result_type(float))), {})
 
 
 def _ahead(robot: Robot, places: np.ndarray) -> np.ndarray:
     """How far places (K, 3) in the room are ahead of the middle of the driven wheels, at rest [m]."""
-    data = _rested(robot)
-    return (places - tyre_places(robot.host, data, robot.joints).mean(0)) @ _axes(robot, data)[0]
+    return (places - tyre_places(robot.host, robot.resting, robot.joints).mean(0)) @ robot.axes[0]
 
 
 def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.ndarray, float]:
     """Mass, its centre (3,) from the middle of the driven wheels, and yaw inertia about it; `arrays` of the model are
     replaced."""
-    host, data = robot.host, _rested(robot)
+    host, data = robot.host, robot.resting
     model: Any = Overlaid(host, arrays)
-    bodies = np.flatnonzero(host.body_rootid == _root(robot))
+    bodies = np.flatnonzero(host.body_rootid == robot.base)
     middle = tyre_places(host, data, robot.joints).mean(0)
-    masses, places = model.body_mass[bodies], (data.xipos[bodies] - middle) @ _axes(robot, data).T
+    masses, places = model.body_mass[bodies], (data.xipos[bodies] - middle) @ robot.axes.T
     mass = float(masses.sum())
     centre = masses @ places / mass
     upright = np.square(data.ximat[bodies].reshape(-1, 3, 3)[:, 2])
@@ -162,9 +141,8 @@ def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.nda
 
 def extent_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest place (3,) of its geoms at rest: ahead of the driven axle's middle, to the left and up [m]."""
-    host, data = robot.host, _rested(robot)
-    axes = _axes(robot, data)
-    geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == _root(robot))
+    host, data, axes = robot.host, robot.resting, robot.axes
+    geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == robot.base)
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     middle = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, host.geom_aabb[geoms, :3])
     middle = (middle - tyre_places(host, data, robot.joints).mean(0)) @ axes.T

@@ -28,12 +28,15 @@ class StatedDrive:
     steering: str = ""  # plugin that drives it as a car or a tricycle
     sideways: str = ""  # plugin that drives it sideways too
     rollers: tuple[str, ...] = ()  # links that are drawn as mecanum or omni wheels
+    radius: float | None = None  # of the driven wheels, as a plugin takes it [m]
+    track: float | None = None  # distance between the driven wheels, as a plugin takes it [m]
 
 
 def stated_drive(top: ElementTree.Element) -> StatedDrive:
     """What the URDF says of its drive."""
     sides: dict[str, list[str]] = {"left": [], "right": []}
     steering = sideways = ""
+    radius = track = None
     for plugin in top.iter("plugin"):
         name = f"{plugin.get('filename', '')} {plugin.get('name', '')}"
         if STEERS.search(re.sub(r"skid[_-]?steer", "", plugin.get("filename", ""), flags=re.I)):  # names are free
@@ -42,13 +45,27 @@ def stated_drive(top: ElementTree.Element) -> StatedDrive:
         if SIDEWAYS.search(name):
             sideways = sideways or _short(plugin)
         if DRIVES.search(name):
+            radius = radius or _size(plugin, "wheelradius") or _size(plugin, "wheeldiameter", 0.5)
+            track = track or _size(plugin, "wheelseparation")
             for one in plugin.iter():
                 if (found := SIDE.fullmatch(one.tag)) and (joint := (one.text or "").strip()):
                     sides[found[1].lower()].append(joint)
     rollers = [link.get("name", "") for link in top.iter("link")
                if any(ROLLERS.search(mesh.get("filename", "")) for mesh in link.iter("mesh"))]
     return StatedDrive(_once(sides["left"]), _once(sides["right"]), _once(_by_speed(top)), steering, sideways,
-                       tuple(rollers))
+                       tuple(rollers), radius, track)
+
+
+def _size(plugin: ElementTree.Element, name: str, factor: float = 1.0) -> float | None:
+    """Positive number of a plugin's tag, whatever its case and underscores, times a factor; None without one."""
+    for one in plugin.iter():
+        try:
+            value = float(one.text or "") if one.tag.replace("_", "").lower() == name else 0.0
+        except ValueError:
+            continue
+        if 0 < value < float("inf"):
+            return factor * value
+    return None
 
 
 def _by_speed(top: ElementTree.Element) -> Iterator[str]:

@@ -47,7 +47,7 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDri
         sides_of_plugin = _plugin_wheels(path, standing, stated)
         _refuse_steering(path, hinges, standing, "" if sides_of_plugin else stated.steering)
         if (found_sides := sides_of_plugin or _stated_wheels(standing, stated)) is not None:
-            return found_sides
+            return _with_followers(spec, standing, found_sides)
     pulled = [name for name in hinges if name in driven.values()]
     for among in (pulled, list(hinges)):
         sides = [[name for name in among if side in name.lower() and _may_roll(hinges[name])]
@@ -58,7 +58,7 @@ def wheel_joints(path: Path, spec: Any, wheels: Sequence[str], stated: StatedDri
     active = [name for name in hinges if not PASSIVE.search(f"{name} {hinges[name].parent.name}")]
     wheels_alone = [name for name in rolling if name in active]
     level = [name for name in active if standing and name in standing and standing[name].is_wheel]
-    for names in ([name for name in pulled if name in rolling], wheels_alone, rolling, level):
+    for names in ([name for name in pulled if name in rolling], wheels_alone, level, rolling):
         if names and standing is not None and (in_order := _by_side(standing, names)) is not None:
             return in_order
     axles = [name for name in hinges if standing and standing[name].is_wheel]
@@ -174,6 +174,16 @@ def _stated_wheels(standing: Mapping[str, _Stand], stated: StatedDrive) -> tuple
     return _by_side(standing, names) if names else None
 
 
+def _with_followers(spec: Any, standing: Mapping[str, _Stand], joints: tuple[str, ...]) -> tuple[str, ...]:
+    """Driven joints and those of wheels that mimic them, in order; without these where they are not in pairs."""
+    half, sides = len(joints) // 2, list[list[str]]()
+    for side in (joints[:half], joints[half:]):
+        following = {one.name1 for one in spec.equalities if one.type == mujoco.mjtEq.mjEQ_JOINT and one.name2 in side}
+        names = {*side, *(name for name in following if name in standing and standing[name].is_wheel)}
+        sides.append(sorted(names, key=lambda one: -standing[one].place[0]))
+    return (*sides[0], *sides[1]) if len(sides[0]) == len(sides[1]) else joints
+
+
 def _refuse_steering(
     path: Path, hinges: Mapping[str, Any], standing: Mapping[str, _Stand], plugin: str
 ) -> None:  # fmt: skip
@@ -210,34 +220,72 @@ def _rolls(joint: Any) -> bool:
 
 
 def swapped(path: Path, spec: Any, wheels: Sequence[str], joints: Sequence[str]) -> list[str]:
-    """A note where of two wheels the right one was named first."""
+    """A note where the wheels of the right side were named first."""
     targets = {actuator.name: actuator.target for actuator in spec.actuators}
-    if len(wheels) != 2 or targets.get(wheels[0], wheels[0]) == joints[0]:
+    half = len(joints) // 2
+    named = [targets.get(name, name) for name in wheels]
+    if not named or set(named[:half]) != set(joints[half:]):
         return []
-    return [f"{path.name}: --wheels names {wheels[0]} first, but {joints[0]} is on the left, with x ahead: it is taken "
-            "for the left one. Where the robot's front is -x, turn its first body by 180 degrees in the file"]
+    first, left = (" and ".join(one[:half]) for one in (wheels, joints))
+    return [f"{path.name}: --wheels names {first} first, but {left} {'is' if half == 1 else 'are'} on the left, with x "
+            "ahead, and taken so. Where the robot's front is -x, turn its first body by 180 degrees in the file"]
+
+
+def leftwards(path: Path, joints: Sequence[str], tyres: np.ndarray) -> tuple[np.ndarray, float]:
+    """Vector (3,) of length 1 from the right wheels to the left ones, and the distance between them [m].
+
+    `joints`: those on the left, then those on the right; `tyres`: (W, 3) where they stand. ValueError where a wheel of
+    the left stands to the right of one of the right: names, or a plugin, say what places deny.
+    """
+    half = len(joints) // 2
+    left = tyres[:half].mean(0) - tyres[half:].mean(0)
+    distance = float(np.linalg.norm(left))
+    left = left / max(distance, 1e-12)
+    along = tyres @ left
+    worst, other = int(along[:half].argmin()), half + int(along[half:].argmax())
+    if half > 1 and not along[worst] > along[other]:
+        raise ValueError(f"{path}: {joints[worst]} is taken for a wheel of the left and {joints[other]} for one of the "
+                         "right, but they stand the other way round. Correct their names, or those in the plugin.")
+    return left, distance
+
+
+def turned_round(path: Path, joints: Sequence[str], ahead: float) -> list[str]:
+    """A note where the left wheels stand on the right with x ahead, `ahead` being the cosine between x and the
+    front."""
+    if ahead > -LEVEL:
+        return []
+    left = ", ".join(joints[: len(joints) // 2])
+    return [f"{path.name}: {left} on the left: so the robot's front is taken to be -x. If it is +x, names or plugin "
+            "exchange the sides; name the wheels with --wheels, those at y > 0 first"]
 
 
 def _paired(path: Path, spec: Any, wheels: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Joints of named wheels by their sides."""
-    if len(names) == 2 and _sides(wheels) in ([1, -1], [-1, 1]):
-        return (names[0], names[1]) if _sides(wheels) == [1, -1] else (names[1], names[0])
-    standing = _standing(spec, {name: spec.joint(name) for name in names})
+    """Joints of named wheels by their sides: as they were named, where places or names agree with that."""
+    standing, half = _standing(spec, {name: spec.joint(name) for name in names}), len(names) // 2
+    placed = None if standing is None else _by_side(standing, names, [0] * len(names))
+    if placed is not None and set(placed[:half]) == set(names[:half]):
+        return placed
+    if len(names) == 2:
+        as_named = _sides(wheels) != [-1, 1] if placed is None else _sides(wheels) == [1, -1]
+        return (names[0], names[1]) if as_named else (names[1], names[0])
     found = None if standing is None else _by_side(standing, names)
-    if found is None and len(names) == 2:
-        return names[0], names[1]
     if found is None:
         raise ValueError(f"{path}: wheels {', '.join(names)} do not stand in pairs, one left and one right. Name the "
                          "driven wheels of both sides.")
     return found
 
 
-def _by_side(standing: Mapping[str, _Stand], names: Sequence[str]) -> tuple[str, ...] | None:
-    """Left ones, then right ones, both from front to rear; None where they do not stand in pairs with level axles."""
+def _by_side(
+    standing: Mapping[str, _Stand], names: Sequence[str], sides: Sequence[int] | None = None
+) -> tuple[str, ...] | None:  # fmt: skip
+    """Left ones, then right ones, both from front to rear; None where they do not stand in pairs with level axles.
+
+    `sides`: 1 for one known to be on the left, -1 on the right, 0 where its place says; by default as their names do.
+    """
     ours = [standing[name] for name in names]
     place = np.array([one.place for one in ours])
     across = [abs(float(one.axis[1])) > LEVEL for one in ours]
-    stated = _sides(names)
+    stated = _sides(names) if sides is None else list(sides)
     if any(abs(float(one.axis[2])) > LEVEL for one in ours) or not (all(stated) or all(across)):
         return None
     sides = [one or (1 if y > place[:, 1].mean() else -1) for one, y in zip(stated, place[:, 1], strict=True)]

@@ -179,6 +179,15 @@ def test_a_robot_that_drives_backwards_is_named(tmp_path):
     assert not any("it drives backwards" in line for line in describe_robot(robot, check))
 
 
+def test_a_robot_that_explodes_in_a_trial_drive_is_named(tmp_path):
+    robot = load_robot(cart_file(tmp_path, SERVOS[1]))
+    check = check_robot(robot)
+    assert not check.explodes
+    lost = replace(check, explodes=True)
+    assert not lost.drives_straight
+    assert any("it explodes in a trial drive" in line for line in describe_robot(robot, lost))
+
+
 def test_the_floor_that_is_added_lies_under_the_wheels_wherever_their_bodies_begin(tmp_path):
     """As CAD programs write it: all bodies begin at one point, and joints and shapes are where they are."""
     path = cart_file(tmp_path, SERVOS[1])

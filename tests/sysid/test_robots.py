@@ -605,7 +605,7 @@ def test_an_actuator_without_a_name_is_called_after_what_it_acts_on(tmp_path, ac
 def test_a_servo_that_its_bearing_holds_back_is_named(tmp_path):
     robot = load_robot(car_file(tmp_path, SERVOS))
     lines = "\n".join(describe_robot(robot, check_robot(robot)))
-    assert ("actuator of joint left (kv 0.01 N m s/rad) is held back by a damping of 0.03 of joint left: it reaches "
+    assert ("actuator left (kv 0.01 N m s/rad) is held back by a damping of 0.03 of joint left: it reaches "
             "25% of its speed") in lines
 
 

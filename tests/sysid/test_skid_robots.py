@@ -41,12 +41,14 @@ def test_the_simulators_vehicle_is_fitted_with_the_files_mass_and_places_of_whee
     seen, model = subject(log, FitConfig(model=str(file)))
     assert seen.spec.drive == "skid" and seen.spec.track == log.spec.track
     axles = np.array(next(one for one in SKIDS.values() if one.mass == pytest.approx(seen.spec.mass)).axles)
-    assert seen.spec.wheelbase == pytest.approx(2 * np.sqrt(np.mean(axles**2)), abs=1e-5)
+    assert seen.spec.wheelbase == pytest.approx(np.ptp(axles), abs=1e-5)
     assert any("is skid-steered: the simulator's vehicle is fitted" in note for note in seen.notes)
     again, _ = subject(seen, FitConfig(model=str(file)), model)
     assert again.notes == seen.notes and again.spec == seen.spec
     given = make_problem(seen, FitConfig(model=str(file), physics_dt=0.01), model=model)
     assert given.model is None and given.plant.host is None
+    inside = [effect for effect in given.params.effects if effect.name == "middle_wheels"]
+    assert [float(effect.share) for effect in inside] == [pytest.approx(1 / 3)] * (len(axles) == 3)
     names = set(given.space.names)
     assert {"wheel_radius_difference.common", "slip_traction.mu", "slip_traction.slip_speed",
             "slip_traction.side_slip_speed", "yaw_scrub.torque", "pose_mount.x"} <= names
@@ -70,7 +72,8 @@ def test_radius_and_tracked_point_of_a_skid_steered_robot_come_out_of_two_drives
     log, file = robot
     names = ("wheel_radius_difference.common", "slip_traction.mu", "slip_traction.slip_speed",
              "slip_traction.side_slip_speed", "yaw_scrub.torque", "torque_drive.kp", "torque_drive.ki",
-             "command_delay.delay", "pose_mount.x", "pose_mount.y", "pose_mount.yaw")
+             "torque_drive.limit", "torque_drive.windup", "command_delay.delay", "pose_mount.x", "pose_mount.y",
+             "pose_mount.yaw")
     config = FitConfig(model=str(file), method="lm", physics_dt=0.01, iterations=8, elsewhere=False, parameters=names,
                        effects=("wheel_radius_difference", "pose_mount"))
     fit = fit_log(log, config)

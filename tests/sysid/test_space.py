@@ -11,12 +11,12 @@ import pytest
 from benchmarks.planted_logs import Schedule, fitted_plant, write_dataset
 from sysid.errors.space import RATIO, Space, make_space, searched
 from sysid.logs.log import load_log
-from sysid.missing.catalogue import hypotheses
+from sysid.missing.catalogue import base_values, hypotheses, with_catalogue
 from sysid.replay.differences import make_replay
 from sysid.replay.models import measured_effects, with_effects
 from whill_mjx.effects import EFFECTS
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
-from whill_mjx.vehicle.presets import in_short, preset_params
+from whill_mjx.vehicle.presets import in_short, preset, preset_params
 from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR, find_spec, in_proportion
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
 
@@ -172,6 +172,32 @@ def test_forces_and_sizes_that_are_looked_for_follow_the_vehicle():
     assert dict(chair["payload_shift"].constants) == {"payload_shift.z": 0.3}
     assert other["supply_sag/power"].axes[0].unit == pytest.approx(0.0006 * 512)
     assert dict(other["payload_shift"].constants)["payload_shift.z"] == pytest.approx(0.3 / 8)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("size", [1 / 8, 1.0, 4.0])
+def test_lengths_on_the_vehicle_follow_its_size(size):
+    """Trail of a caster and places of a load, in a fit and in the closed loop."""
+    spec = in_proportion(WHILL_CR, "like_the_chair", 0.1325 * size, 0.496 * size, 0.6 * size, 52.0 * size**3)
+    params = preset_params(spec, "physical")
+    found = hypotheses(spec, params)
+    full = with_catalogue(params, found)
+    assert get_values(full, ["caster_kick.trail"])[0] == pytest.approx(0.15 * size)
+    load = next(one for one in found if one.key == "payload_shift")
+    farthest = load.values(np.array([0.01, 12.0, -12.0]), base_values(full))
+    assert farthest["payload_shift.x"] == pytest.approx(0.6 * size)
+    assert farthest["payload_shift.y"] == pytest.approx(-0.6 * size)
+    names = ["caster_kick.trail", "payload_shift.x", "payload_shift.y", "payload_shift.z"]
+    space = make_space(full, spec, names)
+    np.testing.assert_allclose(space.low, np.array([0.03, -0.6, -0.4, -0.2]) * size, rtol=1e-5)
+    np.testing.assert_allclose(space.high, np.array([0.5, 0.6, 0.4, 1.0]) * size, rtol=1e-5)
+
+
+@pytest.mark.quick
+def test_a_base_model_with_a_caster_keeps_its_trail():
+    spec, params = preset("whill_cr_castored")
+    params = set_values(params, ["caster_kick.trail"], jnp.array([0.4]))
+    assert get_values(with_catalogue(params, hypotheses(spec, params)), ["caster_kick.trail"])[0] == pytest.approx(0.4)
 
 
 @pytest.mark.quick

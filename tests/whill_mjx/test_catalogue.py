@@ -93,7 +93,7 @@ def test_every_effect_vanishes_to_the_last_bit_at_its_neutral_value(name):
             # Springs are the same at their neutral values; their loads are then those of the end of a step.
             assert after.sprung == (name == "suspension")
             after = replace(after, sprung=before.sprung)
-            jax.tree.map(np.testing.assert_array_equal, replace(after, payload=None, ground=()), before)
+            jax.tree.map(np.testing.assert_array_equal, replace(after, payload=None, ground=(), middle=None), before)
             for surface in after.ground:  # that the motion is the same to the last bit: test_ground.py
                 for part in surface.height(jnp.array([0.7, -1.2]), jnp.array([0.1, 30.0])):
                     np.testing.assert_array_equal(part, 0.0)

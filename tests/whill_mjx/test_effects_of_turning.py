@@ -7,12 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_in_hand import DT, motion_at, quick, run, signal, step_command
+from effects_in_hand import DT, chair, motion_at, quick, run, signal, step_command
+from scipy.optimize import brentq
 
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.card import Scale
+from whill_mjx.effects.planar import at_contacts, at_wheels, loads_of_wheels
 from whill_mjx.vehicle.config import VehicleConfig
-from whill_mjx.vehicle.dynamics import place, substep
+from whill_mjx.vehicle.dynamics import nominal_world, place, substep
 from whill_mjx.vehicle.kinematics import body_twist
 from whill_mjx.vehicle.model import build_model
 from whill_mjx.vehicle.presets import preset_params
@@ -26,7 +28,7 @@ STEP, SETTLED = 0.01, 300
 def robot():
     """A Warthog with all effects of this file, and a compiled drive of one command until it is steady."""
     params = preset_params(WARTHOG, "physical")
-    more = (make_effect(name) for name in (*NAMES, "turn_efficiency"))
+    more = (make_effect(name) for name in (*NAMES, "turn_efficiency", "middle_wheels"))
     params = replace(params, effects=(*params.effects, *more))
     model = build_model(WARTHOG, VehicleConfig(physics_dt=STEP, limited=False))
 
@@ -114,3 +116,36 @@ def test_in_a_bend_the_vehicle_slides_outwards(command):
 def test_the_loop_looks_for_them_on_skid_drives_alone(name):
     card = EFFECTS[name].card
     assert card.variants_of(Scale(WARTHOG, frozenset())) and not card.variants_of(Scale(WHILL_CR, frozenset()))
+
+
+@quick
+@pytest.mark.parametrize("share", [0.0, 0.2, 1 / 3])
+def test_wheels_in_the_middle_turn_the_vehicle_as_coulombs_law_says(share):
+    """On the spot, without creep: the moments of friction along and across the wheels are in balance."""
+    half, ahead = WARTHOG.track / 2, WARTHOG.wheelbase / 2
+
+    def balance(slide):  # along the wheels, per yaw rate [m]
+        return share * half + (1 - share) * (half * slide - ahead**2) / np.hypot(slide, ahead)
+
+    coulomb = {"mu": 0.3, "slip_speed": 0.0005, "side_slip_speed": 0.001, "mu_free": 0.0}
+    found = driven([0.0, 1.0], slip_traction=coulomb, yaw_scrub={"torque": 0.0}, rolling_resistance={"mu_r": 0.0},
+                   middle_wheels={"share": share})
+    assert found[2] / found[4] == pytest.approx(half / (half + brentq(balance, 1e-6, 5.0)), rel=0.01)
+
+
+@quick
+def test_six_wheels_share_the_load_evenly_and_their_forces_keep_sum_and_moments():
+    motion = motion_at(omega=1.0, name="husky")
+    assert at_wheels(motion, motion.normal_force) is motion.normal_force is loads_of_wheels(motion)
+    model, _ = chair("husky")
+    _, world = make_effect("middle_wheels", share=1 / 3).world((), nominal_world(model))
+    motion = replace(motion, world=world)
+    np.testing.assert_allclose(loads_of_wheels(motion), np.full(6, 50 * 9.81 / 6), rtol=0.01)
+    places = at_wheels(motion, world.geometry.contact_x)
+    forces = jnp.array([1.0, 2.0, -3.0, 5.0, 7.0, -1.0])
+    corners = at_contacts(forces)
+    np.testing.assert_allclose(corners[::2].sum(), forces[::2].sum(), rtol=1e-6)
+    np.testing.assert_allclose(world.geometry.contact_x @ corners, places @ forces, atol=1e-5)
+    _, world = make_effect("middle_wheels", share=1 / 3).world((), nominal_world(chair()[0]))
+    carried = loads_of_wheels(replace(motion_at(), world=world))
+    np.testing.assert_array_equal(carried[2:4], 0.0)  # no wheels there on a differential drive

@@ -45,9 +45,9 @@ SHOWN = {"bump": {"rise": 0.02, "width": 0.3, "x": 0.9, "y": 0.2},
 ELSEWHERE = {"unnamed"}
 """Tables, most of whose knots one drive does not reach: test_catalogue.py and test_effect_unnamed.py."""
 SILENT = {"command_delay.delay", "command_dead_zone.linear", "command_dead_zone.wheel", "motor_line.no_load_speed",
-          "motor_line.droop"}
+          "motor_line.droop", "middle_wheels.share"}
 """Parameters that this drive does not tell: the ramp behind a delay swallows it, v and wheel speeds stay large, and the
-chair's torques end far below the line of a motor."""
+chair's torques end far below the line of a motor; only a skid drive has wheels in the middle."""
 
 
 GROUPS = {"drive": ("command", "actuation", "sensing"), "ground": ("force", "world")}

@@ -107,23 +107,23 @@ def yaw_rate(motion: Motion) -> jax.Array:
 
 
 def per_side(values: jax.Array) -> jax.Array:
-    """Sums (2,) over the left and the right contacts of values (4,)."""
-    return jnp.stack([values[0] + values[2], values[1] + values[3]])
+    """Sums (2,) over the left and the right wheels of values (2 A,) of A axles, left and right of each."""
+    return jnp.stack([sum((values[k] for k in range(side + 2, len(values), 2)), values[side]) for side in (0, 1)])
 
 
-def to_contacts(values: jax.Array) -> jax.Array:
-    """Values (2,) of the left and right side at each of the four contacts (4,)."""
-    return jnp.stack([values[0], values[1], values[0], values[1]])
+def to_contacts(values: jax.Array, axles: int = 2) -> jax.Array:
+    """Values (2,) of the left and right side at each of the contacts (2 A,) of A axles."""
+    return jnp.stack([values[0], values[1]] * axles)
 
 
 def per_axle(values: jax.Array) -> jax.Array:
-    """Sums (2,) over the rear and the front contacts of values (4,)."""
-    return jnp.stack([values[0] + values[1], values[2] + values[3]])
+    """Sums (A,) over the contacts of each axle, from rear to front, of values (2 A,)."""
+    return jnp.stack([values[k] + values[k + 1] for k in range(0, len(values), 2)])
 
 
 def to_axles(values: jax.Array) -> jax.Array:
-    """Values (2,) of the rear and the front axle at each of the four contacts (4,)."""
-    return jnp.stack([values[0], values[0], values[1], values[1]])
+    """Values (A,) of axles, from rear to front, at each of their contacts (2 A,)."""
+    return jnp.stack([values[k // 2] for k in range(2 * len(values))])
 
 
 def driven_mean(motion: Motion, values: jax.Array) -> jax.Array:

@@ -86,6 +86,10 @@ class Axis:
     """Smallest and largest factor on the size that drives cannot determine, because the effect leaves it open."""
     dependent: bool = False
     """Whether it does nothing by itself, but changes what the other axes do."""
+    start: float | None = None
+    """Value at q = 0 where the base model lacks the effect; by default the neutral one, which is the chair's."""
+    reach: float = float("inf")
+    """Largest value of a `moment`, either way."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,16 @@ class Scale:
     def power(self) -> float:
         """Power at that speed against a force that is the same share of the weight, over the chair's [-]."""
         return self.weight / (WHILL_CR.mass * GRAVITY) * self.speed
+
+    @property
+    def length(self) -> float:
+        """Wheelbase over the chair's [-]."""
+        return self.spec.wheelbase / WHILL_CR.wheelbase
+
+    @property
+    def width(self) -> float:
+        """Track over the chair's [-]."""
+        return self.spec.track / WHILL_CR.track
 
     @property
     def height(self) -> float:

@@ -32,7 +32,8 @@ class CasterKick(Effect):
         order=160,
         variants=lambda scale: (
             Variant((Axis("force_limit", scale.force),
-                     Axis("trail", 0.3, form="factor", signed=True, dependent=True, limit=5.0),
+                     Axis("trail", 0.3, form="factor", signed=True, dependent=True, limit=5.0,
+                          start=0.15 * scale.length),
                      Axis("sharpness", 2.0, dependent=True))),
         ),
         forbids=(SAME_LEFT_AND_RIGHT, GONE_WHEN_STRAIGHT, SAME_ALL_DRIVE),

@@ -29,8 +29,10 @@ class PayloadShift(Effect):
         variants=lambda scale: (
             Variant((
                 Axis("mass", 0.08 * scale.spec.mass),
-                Axis("x", 0.01 * scale.spec.mass * scale.spec.wheelbase, form="moment", signed=True, dependent=True),
-                Axis("y", 0.01 * scale.spec.mass * scale.spec.track, form="moment", signed=True, dependent=True),
+                Axis("x", 0.01 * scale.spec.mass * scale.spec.wheelbase, form="moment", signed=True, dependent=True,
+                     reach=0.6 * scale.length),
+                Axis("y", 0.01 * scale.spec.mass * scale.spec.track, form="moment", signed=True, dependent=True,
+                     reach=0.6 * scale.width),
             ), constants=(("z", 0.3 * scale.height),)),
         ),
         forbids=(SHOWS_AT_BOTH_ENDS, SAME_BACKWARD, SAME_ALL_DRIVE),

@@ -19,9 +19,9 @@ class Ahead:
     """Planar motion after one step under all forces except those of the gripping wheels; chassis frame."""
 
     forward: jax.Array  # (2,) speed of the driven contacts of the left and the right side [m/s]
-    left: jax.Array  # (2,) speed of the rear and the front contacts to the left [m/s]
+    left: jax.Array  # (A,) speed of the contacts of each axle, from rear to front, to the left [m/s]
     arm_y: jax.Array  # (2,) of the driven contacts of each side, from the centre of mass to the left [m]
-    arm_x: jax.Array  # (2,) of the rear and front contacts, from the centre of mass forward [m]
+    arm_x: jax.Array  # (A,) of the axles, from the centre of mass forward [m]
 
 
 def look_ahead(motion: Motion) -> Ahead:
@@ -37,13 +37,40 @@ def look_ahead(motion: Motion) -> Ahead:
     ay = others.fy / mass + gravity[1] - rate * vx
     turn = (others.tz - com[0] * others.fy + com[1] * others.fx) / motion.yaw_inertia
     arm_y = driven_mean(motion, motion.world.geometry.contact_y) - com[1]
-    arm_x = motion.world.geometry.contact_x[1:3] - com[0]
+    arm_x = at_wheels(motion, motion.world.geometry.contact_x)[1::2] - com[0]
     return Ahead(
         driven_mean(motion, motion.contact_vx) + motion.dt * (ax - turn * arm_y),
-        per_axle(motion.contact_vy) / 2 + motion.dt * (ay + turn * arm_x),
+        per_axle(at_wheels(motion, motion.contact_vy)) / 2 + motion.dt * (ay + turn * arm_x),
         arm_y,
         arm_x,
     )
+
+
+def at_wheels(motion: Motion, values: jax.Array) -> jax.Array:
+    """Values (4,) at the contacts, at each wheel: (6,) with those midway between them on a vehicle of three axles.
+
+    It holds for places and speeds of one body, which change evenly from contact to contact.
+    """
+    if motion.world.middle is None:
+        return values
+    return jnp.concatenate([values[:2], (values[:2] + values[2:]) / 2, values[2:]])
+
+
+def loads_of_wheels(motion: Motion) -> jax.Array:
+    """Loads (4,) or (6,) [N] of the wheels: those in the middle take their share of both others of their side."""
+    loads, driven = motion.normal_force, motion.world.geometry.driven
+    if motion.world.middle is None:
+        return loads
+    middle = motion.world.middle * driven.min() * (loads[:2] + loads[2:])  # none on a differential drive
+    return jnp.concatenate([jnp.maximum(loads[:2] - middle / 2, 0.0), middle, jnp.maximum(loads[2:] - middle / 2, 0.0)])
+
+
+def at_contacts(forces: jax.Array) -> jax.Array:
+    """Forces (4,) at the contacts with the sum and the moments of those (4,) or (6,) of the wheels."""
+    if len(forces) == 4:
+        return forces
+    middle = forces[2:4] / 2
+    return jnp.concatenate([forces[:2] + middle, forces[4:] + middle])
 
 
 def spin_response(motion: Motion) -> jax.Array:
@@ -68,7 +95,7 @@ def by_mode(values: jax.Array, factors: jax.Array) -> jax.Array:
 def held(
     motion: Motion, ahead: Ahead, grip: jax.Array, wanted: jax.Array, hold: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Speeds forward (2,) and left (2,) of `ahead` with the wheels' forces added, both taken after the step.
+    """Speeds forward (2,) and left (A,) of `ahead` with the wheels' forces added, both taken after the step.
 
     The wheels push with grip (wanted - forward) at each side and with -hold left at each axle: an implicit step, so
     any stiffness is stable. Three equations, of which two are eliminated:
@@ -79,7 +106,7 @@ def held(
         motion, ahead: the present motion, and `look_ahead` of it.
         grip: (2,) of the left and right side [N s/m].
         wanted: (2,) forward speed at which the wheels do not push [m/s].
-        hold: (2,) of the rear and front axle [N s/m].
+        hold: (A,) of the axles, from rear to front [N s/m].
     """
     pull, push = grip * (wanted - ahead.forward), -hold * ahead.left
     inertia = motion.total_mass / motion.dt

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.effects.base import Effect, contact_wrench, per_axle, per_side, to_axles, to_contacts
-from whill_mjx.effects.planar import held, look_ahead
+from whill_mjx.effects.planar import at_contacts, at_wheels, held, loads_of_wheels, look_ahead
 from whill_mjx.vehicle.types import Motion, Wrench, parameter
 
 ROUNDS = 2  # of the implicit step
@@ -48,10 +48,12 @@ class SlipTraction(Effect):
         """Wrench of the slip forces, and their reaction on the driven wheels."""
         geometry = motion.world.geometry
         radius = geometry.wheel_radius  # (2,)
-        slide_x = to_contacts(radius * motion.spin) - motion.contact_vx
-        slide_y = -motion.contact_vy
-        grip = self.mu * motion.normal_force * geometry.driven
-        carried = self.mu_free * motion.normal_force * (1 - geometry.driven)
+        loads, driven = loads_of_wheels(motion), at_wheels(motion, geometry.driven)
+        axles = len(loads) // 2
+        slide_x = to_contacts(radius * motion.spin, axles) - at_wheels(motion, motion.contact_vx)
+        slide_y = -at_wheels(motion, motion.contact_vy)
+        grip = self.mu * loads * driven
+        carried = self.mu_free * loads * (1 - driven)
         relaxation, yielding = motion.dt / motion.wheel_inertia, motion.yielding
         slope = yielding.factor * yielding.slope
         unlimited = yielding.factor * (yielding.slack + yielding.slope * yielding.foreseen)  # [N m] at spin 0
@@ -76,19 +78,19 @@ class SlipTraction(Effect):
             pulled = 1 + relaxation / stays * radius**2 * total
             forward, left = held(motion, ahead, total / pulled, radius * wanted, per_axle(sideways))
             spin = (wanted + relaxation / stays * radius * total * forward) / pulled
-            slide_x, slide_y = to_contacts(radius * spin - forward), -to_axles(left)
+            slide_x, slide_y = to_contacts(radius * spin - forward, axles), -to_axles(left)
         forward, left = stiffness * slide_x, across * slide_y
         # A wheel that a large torque spins up within the step would leave the friction circle.
         excess = jnp.maximum(1.0, jnp.sqrt(forward**2 + left**2 + TINY) / (grip + TINY))
         forward, left = forward / excess, left / excess
         left = left + (sideways - across) * slide_y
-        wrench = contact_wrench(motion, forward, left)
+        wrench = contact_wrench(motion, at_contacts(forward), at_contacts(left))
         reaction = -radius * per_side(forward)
         change, _ = yielding.change((free_spin + relaxation * (unlimited + reaction)) / (1 + relaxation * slope))
         return memory, replace(wrench, spin_torque=reaction + yielding.factor * change)
 
     def _beyond_creep(self, along: jax.Array, across: jax.Array) -> jax.Array:
-        """p (4,) [m/s] for sliding velocities (4,) along and across, by Newton's method on |F|.
+        """p (2 A,) [m/s] for sliding velocities (2 A,) along and across, by Newton's method on |F|.
 
         It starts from the solution for sliding along one axis only.
         """

@@ -319,10 +319,12 @@ the radius of its wheels."""
 RANGES: dict[str, tuple[float, float]] = {
     "body.mass": (SIZE["mass"].low, SIZE["mass"].high),
     "body.yaw_inertia": (1e-6, 1e5),  # of the chair
-    **dict.fromkeys(("body.com_x", "body.com_y", "body.com_z"), (-20.0, 20.0)),
+    **dict.fromkeys(("body.com_x", "body.com_y", "body.com_z", "payload_shift.x", "payload_shift.y", "payload_shift.z"),
+                    (-20.0, 20.0)),
+    "caster_kick.trail": (1e-4, 20.0),
     **dict.fromkeys(
-        ("actuator_lag.cascade", "axle_pivot.freedom", "command_expiry.loss", "rolling_contact.grip",
-         "unnamed.with_motion", "wheel_inertia.reaction"), (0.0, 1.0)),
+        ("actuator_lag.cascade", "axle_pivot.freedom", "command_expiry.loss", "middle_wheels.share",
+         "rolling_contact.grip", "unnamed.with_motion", "wheel_inertia.reaction"), (0.0, 1.0)),
     **dict.fromkeys(("backlash.rotor", "command_dead_zone.release"), (0.001, 1.0)),
     **dict.fromkeys(("incline.along_x", "incline.along_y", "slope.along_x", "slope.along_y"), (-1.5, 1.5)),
     "drive_gain_difference.difference": (-2.0, 2.0),

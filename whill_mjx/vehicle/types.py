@@ -67,6 +67,7 @@ class World:
     speed: jax.Array | float = 0.0  # () m/s, of the chassis ahead at the start of the step
     yaw_rate: jax.Array | float = 0.0  # () rad/s, there
     drift: jax.Array | float = 0.0  # () tangent by which the wheels' line is turned to the left of the heading
+    middle: jax.Array | None = None  # () share of the load on wheels midway between the axles; None without them
     sprung: bool = struct.field(pytree_node=False, default=False)
     """Whether loads are those at the end of a physics step, which any springs allow, or those at its start."""
 
