@@ -30,7 +30,7 @@ BLINDS = ("blank", "freeze", "replay")
 SHARES = ("success", "collision", "timeout", "diverged")
 MEANS = {
     "return": "sum of the rewards",
-    "min_clearance_m": "smallest distance to a box or wall",
+    "min_clearance_m": "smallest distance to a box or wall, of the episodes that came near one",
     "path_length_m": "way of the driven-axle centre",
     "mean_speed_m_s": "path length by time",
     "command_change_rad_s2": "mean absolute change of the commanded yaw rate per time",
@@ -231,8 +231,10 @@ def summarise(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, Any]:
         summary[f"{name}_interval_95"] = list(bootstrap_interval(values)) if len(values) else None
     summary["return_sd"] = float(figures["return"].std())
     summary["episodes_with_near_miss"] = float((figures["near_misses"] > 0).mean())
-    quantiles = np.quantile(figures["min_clearance_m"], [0.01, 0.05, 0.5])
-    summary["min_clearance_m_quantiles"] = dict(zip(("0.01", "0.05", "0.5"), map(float, quantiles), strict=True))
+    with np.errstate(invalid="ignore"):  # it is infinite where nothing is near
+        quantiles = np.quantile(figures["min_clearance_m"], [0.01, 0.05, 0.5])
+    summary["min_clearance_m_quantiles"] = {name: float(value) if np.isfinite(value) else None
+                                            for name, value in zip(("0.01", "0.05", "0.5"), quantiles, strict=True)}
     return summary
 
 
