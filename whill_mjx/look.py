@@ -119,16 +119,16 @@ def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array
     extra = [box(outline.x, outline.y, spec.body_length, spec.body_width, 0.9, dark, yaw)]
     if path is not None:
         extra += [box(point[0], point[1], 0.08, 0.08, 0.95, yellow) for point in path]
-    scene, marker = state.scene, state.scene.marker
+    scene, walls, marker = state.scene, state.scene.walls, state.scene.marker
     edge = 2 * marker.half[1]
     extra.append(box(marker.position[0], marker.position[1], 0.15, edge, 1.4, marker.colour, marker.yaw))
     boxes, off = scene.boxes, jnp.stack([x, y]) - VIEW
-    place = VIEW + (off - jnp.clip(off, -INSIDE, INSIDE))
+    place: jax.Array = jnp.asarray(VIEW) + (off - jnp.clip(off, -INSIDE, INSIDE))
     if scene.hidden is not None:
         boxes = dataclasses.replace(boxes, mask=boxes.mask & ~scene.hidden)
-    if scene.walls is not None:  # the last boxes are those that the camera sees; from above, the nearest are seen
-        boxes = jax.tree.map(lambda leaf: leaf[: leaf.shape[0] - scene.walls.keep], boxes)
-        extra.append(nearest_walls(jnp.asarray(scene.walls.segments), x, y, scene.walls.keep, scene.walls.height))
+    if walls is not None:  # the last boxes are those that the camera sees; from above, the nearest are seen
+        boxes = jax.tree.map(lambda leaf: leaf[: leaf.shape[0] - walls.keep], boxes)
+        extra.append(nearest_walls(jnp.asarray(walls.segments), x, y, walls.keep, walls.height))
         place = jnp.stack([x, y])
     ghosts = scene.ghosts if scene.rich is None else None
     scene = dataclasses.replace(

@@ -216,7 +216,7 @@ def _capsules(rr: ModuleType, rounds: Rounds) -> Any:
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     return rr.Capsules3D(
         lengths=2 * rounds.half[there], radii=rounds.radius[there], translations=foot, quaternions=quaternion,
-        colors=_bytes(rounds.colour[there]), fill_mode="solid",
+        colors=_bytes(np.asarray(rounds.colour)[there]), fill_mode="solid",
     )  # fmt: skip
 
 

@@ -21,12 +21,13 @@ def read_osm(root: ET.Element) -> tuple[list[list[np.ndarray]], list[str]]:
     drawn: list[str] = []  # without some of their corners
     pieces: set[str | None] = set()  # ways of relations, whose outlines stand for them
     for relation in filter(_is_building, root.iter("relation")):
-        roles, name = _roles(relation), f"relation {relation.get('id')}"
+        roles, called = _roles(relation), f"relation {relation.get('id')}"
         outlines, whole = _outlines(roles, ways)
         chosen += outlines
         pieces |= set(roles)
-        cut += [] if whole else [name]
-        drawn += [name] if outlines and short & {ref for ref, role in roles.items() if role in (*OUTER, INNER)} else []
+        cut += [] if whole else [called]
+        borders = {ref for ref, role in roles.items() if role in (*OUTER, INNER)}
+        drawn += [called] if outlines and short & borders else []
     around = {_corners(outline[0]) for outline in chosen}  # a way that has the tags of its relation, too
     for way in filter(_is_building, root.iter("way")):
         name = way.get("id")

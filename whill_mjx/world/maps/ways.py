@@ -86,7 +86,7 @@ def _turning_points(graph: WayGraph, way: np.ndarray, far: np.ndarray) -> np.nda
         here = chosen[-1]
         ahead = here + 1 + np.flatnonzero(far[way[here]] - far[way[here + 1 :]] <= SPACING)
         seen = [one for one in ahead if _sees(graph, way[here], way[one])]
-        chosen.append(max(seen, default=here + 1))
+        chosen.append(int(max(seen, default=here + 1)))
     return way[chosen]
 
 
