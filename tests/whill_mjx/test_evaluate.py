@@ -29,7 +29,6 @@ from whill_mjx.evaluation.rollouts import CHANNELS, View, rollout
 from whill_mjx.evaluation.sweeps import parse_sweep, with_parameter
 from whill_mjx.io.html import STYLE
 from whill_mjx.io.video import write_h264
-from whill_mjx.sensors.commands import Commands
 from whill_mjx.tasks.tasks import make_task
 from whill_mjx.vehicle.kinematics import camera_pose, rotation_from_quaternion
 from whill_mjx.vehicle.presets import preset
@@ -384,27 +383,6 @@ def swerving():
     whole = jax.device_get(recorded)
     episodes = Episodes(whole.trace, whole.ends, whole.scene, keys, course.env.model.config.control_dt)
     return course, episodes, whole.frames
-
-
-def test_late_sensors_remember_decisions_and_not_control_periods():
-    """A driver that turns left and right in turn sees its last commands in turn, as in a training with this period."""
-    env, params = make_env("point_goal", observations={"commands": Commands(3)})
-    env = dataclasses.replace(env, task=dataclasses.replace(env.task, max_steps=16))
-
-    def act(count, state, seen, key):
-        omega = seen["commands"][1::2]
-        turn = jnp.where(count % 2 == 0, 0.5, -0.5)
-        return count + 1, jnp.stack([-1.0 + (omega[0] * omega[1] > 0), turn])  # v: 0 where two commands are alike
-
-    driver = Driver("turning", lambda state, key: jnp.zeros((), jnp.int32), act, period=2)
-    late = dataclasses.replace(nominal(), latency=jnp.ones(()))
-    late = jax.tree.map(lambda leaf: leaf[None], late)
-    keys = jax.random.split(jax.random.key(0), 1)
-    vehicles = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], params)
-    trace = jax.jit(lambda: rollout(env, vehicles, keys, driver, late, view=View(max_latency=1)))().trace[0]
-    actions = np.asarray(trace)[1:, [CHANNELS.index(name) for name in ("action_v", "action_omega")]]
-    assert list(actions[::2, 1]) == [0.5, -0.5] * 4
-    assert (actions[6:, 0] == -1.0).all()
 
 
 def test_a_film_shows_the_recorded_drives_though_their_driver_would_drive_otherwise_now(swerving):

@@ -208,10 +208,10 @@ class _Episodes:
         return states, memory, jnp.clip(action, -1.0, 1.0), image, past
 
     def _hold(self, loop: dict[str, Any]) -> tuple[State, Any, jax.Array, Any, Any]:
-        """The same where it keeps its action; pictures arrive between the decisions too, which sensors do not count."""
+        """The same where it keeps its action; pictures arrive between the decisions too."""
         states, image, past = loop["states"], loop["image"], loop["past"]
         if self.view.max_latency:
-            _, image, past = self._see(loop["step"], states, past)
+            states, image, past = self._see(loop["step"], states, past)
         return states, loop["memory"], loop["action"], image, past
 
 
