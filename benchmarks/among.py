@@ -185,7 +185,7 @@ def judge(options: Options, preset: Preset, params: Any) -> dict[str, Any]:
                 "timeout": episodes.ends["timeout"], "bumped": bumped > 0, "people_bumped": bumped,
                 "people": np.asarray(people.there).sum(-1), "time_s": episodes.ends["time_s"]}  # fmt: skip
         found[sight] = {name: float(np.mean(row)) for name, row in rows.items()}
-        places = _map_of(options, episodes.channel("x")[:, 0])
+        places = _map_of(options, np.stack([episodes.channel(axis)[:, 0] for axis in "xy"], -1))
         if sight == "open":
             found["maps"] = {name: {"episodes": int((places == part).sum()),
                                     **{key: float(np.mean(row[places == part])) for key, row in rows.items()}}
@@ -193,12 +193,13 @@ def judge(options: Options, preset: Preset, params: Any) -> dict[str, Any]:
     return found
 
 
-def _map_of(options: Options, x: np.ndarray) -> np.ndarray:
-    """Number (N,) of the map in which each episode began: the maps lie side by side along x."""
+def _map_of(options: Options, starts: np.ndarray) -> np.ndarray:
+    """Number (N,) of the map in which each episode began at (N, 2) [m]: the one around it, of those side by side."""
     group = side_by_side([make_map_scene(read_map(name)) for name in maps_of(options, options.unseen).split(",")])
     pairs = zip(group.parts, group.shifts, strict=True)
-    firsts = np.array([part.walls.segments[..., 0].min() + shift[0] for part, shift in pairs])
-    return np.searchsorted(firsts, x, side="right") - 1
+    corners = [part.walls.segments.reshape(-1, 2) + shift for part, shift in pairs]
+    inside = [(starts >= one.min(0)).all(-1) & (starts <= one.max(0)).all(-1) for one in corners]
+    return np.argmax(inside, 0)
 
 
 @contextmanager

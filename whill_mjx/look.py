@@ -51,6 +51,8 @@ QUICKLY = {"xla_backend_optimization_level": 1}
 """Of programs that run once: compiling takes longer than they do, and the picture is the same bit for bit."""
 RECORDING = ".rrd"
 """Ending of a recording for the Rerun viewer."""
+VIEW, INSIDE = np.array([2.6, 0.0], np.float32), np.array([4.0, 2.0], np.float32)
+"""Middle of the view from above, and how far from it the view lets a vehicle go [m]."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,8 @@ def contact_sheet(env: Env, params: VehicleParams, worlds: int, steps: int, seed
 def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array:
     """World of one instance from 12 m above, as wide as its camera image and twice as high; +x is up.
 
-    The vehicle is drawn as a dark box, and each point of `path` (T, 2) as a small yellow one.
+    The vehicle is drawn as a dark box, and each point of `path` (T, 2) as a small yellow one. The view follows a
+    vehicle that would leave it, and in a map every one. Colours are plain ones, without ceiling and lamps.
     """
     x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
     spec, outline = env.model.spec, footprint(env.model.spec, x, y, yaw)
@@ -116,20 +119,26 @@ def top_view(env: Env, state: State, path: jax.Array | None = None) -> jax.Array
     extra = [box(outline.x, outline.y, spec.body_length, spec.body_width, 0.9, dark, yaw)]
     if path is not None:
         extra += [box(point[0], point[1], 0.08, 0.08, 0.95, yellow) for point in path]
-    marker = state.scene.marker
+    scene, walls, marker = state.scene, state.scene.walls, state.scene.marker
     edge = 2 * marker.half[1]
     extra.append(box(marker.position[0], marker.position[1], 0.15, edge, 1.4, marker.colour, marker.yaw))
-    boxes, walls, eye = state.scene.boxes, state.scene.walls, jnp.array([2.6, 0.0, 12.0])
+    boxes, off = scene.boxes, jnp.stack([x, y]) - VIEW
+    place: jax.Array = jnp.asarray(VIEW) + (off - jnp.clip(off, -INSIDE, INSIDE))
+    if scene.hidden is not None:
+        boxes = dataclasses.replace(boxes, mask=boxes.mask & ~scene.hidden)
     if walls is not None:  # the last boxes are those that the camera sees; from above, the nearest are seen
         boxes = jax.tree.map(lambda leaf: leaf[: leaf.shape[0] - walls.keep], boxes)
         extra.append(nearest_walls(jnp.asarray(walls.segments), x, y, walls.keep, walls.height))
-        eye = jnp.stack([x, y, jnp.asarray(12.0)])
-    scene = dataclasses.replace(state.scene, boxes=stack_boxes([boxes, *extra]), walls=None)
+        place = jnp.stack([x, y])
+    ghosts = scene.ghosts if scene.rich is None else None
+    scene = dataclasses.replace(
+        scene, boxes=stack_boxes([boxes, *extra]), walls=None, hidden=None, ghosts=ghosts, finish=None, rich=None
+    )
     height, width = 2 * env.height, env.width
     down = jnp.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # right is -y, down is -x, forward is -z
     focal = jnp.asarray(height * 12.0 / 9.0)  # 9 m of ground over the height
     intrinsics = Intrinsics(focal, focal, jnp.asarray(width / 2), jnp.asarray(height / 2), height=height, width=width)
-    return render(eye, down, intrinsics, scene)
+    return render(jnp.append(place, 12.0), down, intrinsics, scene)
 
 
 def _drive(

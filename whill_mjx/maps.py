@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +15,8 @@ if starts(__name__):
 import numpy as np
 
 from whill_mjx.io.folders import check_file, note_written, write_whole
-from whill_mjx.world.maps import Reach, make_map_scene, read_map, wall_segments
+from whill_mjx.vehicle.vehicle_file import load_vehicle
+from whill_mjx.world.maps import Reach, make_map_scene, reach_of, read_map, wall_segments
 from whill_mjx.world.maps.picture import from_above
 
 
@@ -32,8 +33,11 @@ class Import:
     """Edge of a cell of footprints, point clouds and meshes [m]."""
     scale: Annotated[float, Range(1e-6, 1e3)] = 1.0
     """Metres per unit of a point cloud, a mesh or projected CityGML; 0.001 for millimetres, 0.3048 for feet."""
-    width: Annotated[float, POSITIVE] = 0.9
-    """Narrowest passage that the vehicle uses [m]."""
+    vehicle: str = "whill_cr_ramp"
+    """Built-in vehicle (docs/howto/vehicle.md lists them), or a vehicle file: its size says which ways are wide enough,
+    and where it can turn."""
+    width: Annotated[float | None, POSITIVE] = None
+    """Narrowest passage that the vehicle uses [m]; by default what its width needs."""
     pixels: Annotated[int, Range(100, 8000)] = 1200
     """Longer side of the picture."""
 
@@ -44,9 +48,10 @@ def main(options: Import) -> None:
     with refusing():
         for path in (picture, arrays):
             check_file("--out", path)
+        name, reach = _needed(options)
         grid = read_map(options.file, options.cell, options.scale)
         try:
-            made = make_map_scene(grid, Reach(passing=options.width / 2))
+            made = make_map_scene(grid, reach)
         except ValueError as error:
             raise ValueError(f"{options.file}: {error}") from None
     size = np.array(grid.cells.shape[::-1]) * grid.resolution
@@ -54,6 +59,7 @@ def main(options: Import) -> None:
     print(f"{options.file}: {size[0]:.1f} x {size[1]:.1f} m in cells of {grid.resolution:g} m")
     if grid.shift != (0.0, 0.0):
         print("moved to zero: add {:.0f}, {:.0f} m to x, y of the scene for those of the file".format(*grid.shift))
+    print(f"clearance for {name}: {reach.passing:g} m on the way, {reach.standing:g} m at start and goal")
     print(f"free and within reach: {made.space.sum() * grid.resolution**2:.0f} m2")
     for note in grid.notes:
         print(note)
@@ -69,6 +75,13 @@ def main(options: Import) -> None:
     write_whole(picture, from_above(made, options.pixels))
     note_written(picture)
     print(f"{picture}, {arrays}")
+
+
+def _needed(options: Import) -> tuple[str, Reach]:
+    """Name of the vehicle, and what it needs of a map."""
+    spec = load_vehicle(options.vehicle)[0]
+    reach = reach_of(spec)
+    return spec.name, reach if options.width is None else replace(reach, passing=options.width / 2)
 
 
 def cli() -> None:

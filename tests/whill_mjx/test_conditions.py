@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, observe, reset_state
-from whill_mjx.evaluation.conditions import arranged, begin_under, nominal, seen_under
+from whill_mjx.evaluation.conditions import _lit, arranged, begin_under, nominal, seen_under
 from whill_mjx.vehicle.kinematics import camera_pose, rotation_from_quaternion
+from whill_mjx.world.gallery import gallery
 from whill_mjx.world.rich import OBSTACLE, THINGS, furnish, roles_of
 
 LABELS = 3
@@ -113,3 +114,11 @@ def test_things_leave_a_passage_beside_an_obstacle_that_was_moved(room):
     gap = (boxes.centre[..., 1] - reach_y)[:, things] - (boxes.centre[..., 1] + reach_y)[:, [carton]]
     left = beside & (boxes.centre[:, things, 1] > 0)
     assert left.sum() > 5 and gap[left].min() > 0.9
+
+
+def test_less_light_dims_lamps_and_fog_too():
+    scene = gallery()
+    dim = _lit(dataclasses.replace(nominal(), light=jnp.array(0.5)), scene)
+    np.testing.assert_allclose(dim.finish.lamp_colour, 0.5 * scene.finish.lamp_colour)
+    np.testing.assert_allclose(dim.finish.fog_colour, 0.5 * scene.finish.fog_colour)
+    assert float(dim.looks.ambient) == 0.5 * float(scene.looks.ambient) and dim.finish.fog == scene.finish.fog

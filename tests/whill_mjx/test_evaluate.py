@@ -32,6 +32,8 @@ from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.tasks import make_task
 from whill_mjx.vehicle.kinematics import camera_pose, rotation_from_quaternion
 from whill_mjx.vehicle.presets import preset
+from whill_mjx.world.maps.walls import map_walls
+from whill_mjx.world.solids import Solids, post
 
 
 @pytest.fixture(scope="module")
@@ -222,6 +224,55 @@ def test_figures_of_made_up_traces():
     summary = summarise(episodes)
     assert summary["time_to_goal_s"] == 0.5 and summary["collision"] == pytest.approx(1 / 3)
     assert summary["episodes_with_near_miss"] == pytest.approx(1 / 3)
+
+
+@pytest.mark.quick
+def test_episodes_that_come_near_nothing_have_figures_that_json_can_hold():
+    """Of a map only walls within reach count, so in a hall the clearance is infinite."""
+    far = [np.inf] * 3
+    for near, middle in ((1, 0.5), (2, None)):
+        episodes = made_up([[0.5] * 3] * (3 - near) + [far] * near, [("timeout", 0.2)] * 3)
+        summary = json.loads(json.dumps(summarise(episodes), allow_nan=False))
+        assert summary["min_clearance_m"] == 0.5 and summary["min_clearance_m_quantiles"]["0.5"] == middle
+    assert summarise(made_up([far], [("timeout", 0.2)]))["min_clearance_m"] is None
+
+
+def walled(task, place):
+    """Scene in a map with a post, and its goal at a place (2,)."""
+    scene = task.sample_world(jax.random.key(0)).scene
+    walls = map_walls(np.array([[[0.0, 0.0], [20.0, 0.0]], [[20.0, 0.0], [20.0, 9.0]]]), keep=1)
+    marker = dataclasses.replace(scene.marker, position=jnp.array([*place, 1.0]))
+    rounds = Solids(None, post(place[0] - 1.0, place[1], 1.0, 0.2, (0.5, 0.5, 0.5)))
+    return dataclasses.replace(scene, marker=marker, walls=walls, solids=rounds)
+
+
+@pytest.mark.quick
+def test_a_picture_of_any_world_holds_path_goal_walls_and_posts():
+    plt, task = pages._pyplot(), make_task("point_goal")
+    for place, path in (((12.0, 5.0), [[18.0, 2.0], [12.5, 5.0]]), ((-3.0, -1.0), [[0.0, 0.0], [-2.8, -0.9]])):
+        figure, axes = plt.subplots()
+        pages.draw_scene(axes, walled(task, place), 0.5, np.array(path))
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        for x, y in (*path, place):
+            assert left + 1.0 < x < right - 1.0 and low + 1.0 < y < high - 1.0
+        assert len(axes.collections[0].get_segments()) == 2
+        circles = [one.center for one in axes.patches if hasattr(one, "center")]
+        assert any(np.allclose(one, [place[0] - 1.0, place[1]]) for one in circles)
+        plt.close(figure)
+    figure, axes = plt.subplots()
+    lane = make_task("obstacle_course").sample_world(jax.random.key(0)).scene
+    pages.draw_scene(axes, lane, 1.0, np.array([[0.0, 0.0], [5.0, 0.5], [np.nan, np.inf]]))
+    assert axes.get_xlim() == pytest.approx((-1.0, 5.3 + 1.6)) and axes.get_ylim() == (-2.2, 2.2)
+    plt.close(figure)
+
+
+@pytest.mark.quick
+def test_an_ending_of_the_tasks_own_is_shown_by_its_name():
+    episodes = made_up([[1.0] * 3] * 2, [("lost_sight", 0.2), ("success", 0.1)])
+    episodes = dataclasses.replace(episodes, ends={**episodes.ends, "lost_sight": np.array([1.0, 0.0])})
+    assert [pages.ending(episodes, index) for index in range(2)] == ["lost_sight", "success"]
+    table = pages._figures({"policy": summarise(episodes)})
+    assert re.search(r"lost sight.{0,40}50\W*%", table)
 
 
 @pytest.mark.quick

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.look import Look, _missing, depth_picture, main, write_png
+from whill_mjx.env import make_env, reset_state
+from whill_mjx.look import Look, _missing, depth_picture, main, top_view, write_png
 from whill_mjx.tasks.tasks import TASKS
 
 
@@ -39,3 +44,23 @@ def test_unknown_scenes_and_endings_are_refused(tmp_path, options, words):
 @pytest.mark.quick
 def test_a_task_that_needs_a_map_is_left_out_of_all():
     assert "a name is missing" in _missing(TASKS["map_goal"]) and not _missing(TASKS["corridor"])
+
+
+def test_a_furnished_room_is_seen_from_above_without_its_ceiling():
+    env, params = make_env("corridor", looks="rich", height=16, width=16)
+    image = np.asarray(jax.jit(lambda key: top_view(env, reset_state(env, params, key)))(jax.random.key(0)))
+    assert image.shape == (32, 16, 3) and image.std() > 20.0
+    assert image[22:28, 5:11].max(-1).min() < 40  # the vehicle at its start, below the middle
+
+
+def test_the_view_from_above_follows_a_vehicle_that_would_leave_it():
+    env, params = make_env("point_goal", observations={}, height=16, width=16)
+    start = reset_state(env, params, jax.random.key(0))
+
+    @jax.jit
+    def view(x, y):
+        qpos = start.vehicle.qpos.at[:2].set(jnp.stack([x, y]))
+        return top_view(env, dataclasses.replace(start, vehicle=dataclasses.replace(start.vehicle, qpos=qpos)))
+
+    for x, y in ((0.0, 0.0), (-3.0, 0.0), (0.0, 3.3), (1.0, -3.3)):
+        assert (np.asarray(view(x, y)).max(-1) < 40).sum() >= 3  # its dark box

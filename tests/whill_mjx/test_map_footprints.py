@@ -299,6 +299,25 @@ def test_pieces_of_a_relation_and_deleted_ways_are_no_buildings_left_out(tmp_pat
     assert len(load(tmp_path, text).notes) == 1  # how degrees became metres
 
 
+def test_a_border_that_lacks_corners_is_drawn_without_them_and_named(tmp_path):
+    text = town([("outer", 1), ("outer", 2)], [1, 2, 5])
+    own = '<way id="8"><nd ref="11"/><nd ref="12"/><nd ref="13"/><nd ref="14"/><nd ref="11"/>'
+    text = text.replace("<relation", own + '<tag k="building" v="yes"/></way><relation')
+    both = pytest.approx(20.1 * 10.1 + 10.1**2, abs=4.5)
+    grid = load(tmp_path, text)
+    assert len(grid.notes) == 1 and area(grid) == both
+    for after, name in (("2", "relation 77"), ("14", "way 8")):
+        grid = load(tmp_path, text.replace(f'<nd ref="{after}"/>', f'<nd ref="{after}"/><nd ref="90"/>'))
+        assert area(grid) == both and len(grid.notes) == 2
+        assert grid.notes[1].endswith(f"corners that are not in the file, drawn without them: {name}")
+
+
+def test_a_way_that_has_the_tags_of_its_relation_keeps_the_courtyards(tmp_path):
+    text = town([("outer", 4), ("inner", 3)], [3, 4])
+    tagged = text.replace('<way id="4">', '<way id="4"><tag k="building" v="yes"/>')
+    assert area(load(tmp_path, tagged)) == area(load(tmp_path, text)) == pytest.approx(20.1 * 10.1 - HOLE, abs=4.5)
+
+
 def test_a_relation_that_is_cut_off_leaves_no_building_of_its_courtyard(tmp_path):
     cut = [("outer", 1), ("outer", 2), ("inner", 3)]
     with pytest.raises(ValueError, match=r"no building with a footprint \(.*relation 77"):

@@ -14,11 +14,13 @@ import pytest
 
 from whill_mjx import maps
 from whill_mjx.env import make_env, observe, reset_state, step_state
+from whill_mjx.io.command_line import OptionError
 from whill_mjx.learning.identity import identity_of
 from whill_mjx.learning.setup import find_preset
 from whill_mjx.tasks.base import Task
 from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.map_goal import MapGoal
+from whill_mjx.tasks.parts import make_marker
 from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR
 from whill_mjx.world.collision import free_distance, obstacles_of, touches
@@ -43,8 +45,9 @@ from whill_mjx.world.maps.places import farthest_move
 from whill_mjx.world.maps.several import GAP, side_by_side
 from whill_mjx.world.maps.straight import open_space, outline, straight_walls
 from whill_mjx.world.maps.walls import map_walls, most_seen, wall_boxes
+from whill_mjx.world.maps.ways import SPACING, draw_ways
 from whill_mjx.world.render import camera_rotation, pinhole, render_frame
-from whill_mjx.world.scene import footprint, no_boxes, stack_boxes
+from whill_mjx.world.scene import Scene, default_looks, footprint, no_boxes, stack_boxes
 
 pytestmark = pytest.mark.quick
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "maps"
@@ -120,6 +123,13 @@ def test_a_ray_meets_the_first_wall_and_none_slips_through_a_corner():
     np.testing.assert_allclose(aside / jnp.linalg.norm(way, axis=-1), 0.0, atol=1e-4)
 
 
+def test_a_wall_that_is_seen_end_on_is_met_at_the_corner():
+    corners = np.array([[2.0, 0.0], [2.0, 1.0], [4.0, 1.0], [4.0, 0.0]], np.float32)
+    walls = jnp.asarray(np.stack([corners, np.roll(corners, -1, 0)], 1))
+    distance, index = cast(walls, 0.0, 0.0, jnp.array([0.0, np.pi / 2]))
+    assert float(distance[0]) == pytest.approx(2.0, abs=1e-5) and int(index[0]) == 0 and np.isinf(distance[1])
+
+
 def test_the_most_seen_come_first_and_once():
     index, mask = most_seen(jnp.array([7, 3, 7, 7, 9, 3, 1]), 3)
     assert mask.all() and list(np.asarray(index[:2])) == [7, 3] and int(index[2]) in (1, 9)
@@ -162,6 +172,28 @@ def test_a_camera_sees_the_walls_that_all_walls_would_show():
 
     starts = jnp.asarray(made.places.start[::128], jnp.float32)
     assert float(wrong(starts).mean()) <= 0.01
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.4, 0.8])
+def test_a_camera_that_looks_down_sees_the_walls_beside_its_horizon(pitch):
+    """A pillar to the left, which lies in the lower corner of the image, and beyond the bearings of its horizon."""
+    lens, position = pinhole(1.2, 48, 48), jnp.array([0.0, 0.0, 0.8])
+    corners = 5.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    aside = np.tan(0.57)
+    ahead, below = np.cos(pitch) - aside * np.sin(pitch), np.sin(pitch) + aside * np.cos(pitch)
+    corner = 0.8 / below * np.array([ahead, aside])  # where the image's corner shows the ground
+    pillar = 0.8 * corner + 0.03 * corners[::-1] / 5.0
+    segments = np.concatenate([np.stack([one, np.roll(one, -1, 0)], 1) for one in (corners, pillar)])
+    scene = Scene(no_boxes(8), make_marker(50.0, 0.0, 0.1, 0.1), default_looks(), walls=map_walls(segments, keep=8))
+    every = wall_boxes(jnp.asarray(segments, jnp.float32), jnp.arange(8), jnp.ones(8, bool), 2.2, (0.8, 0.8, 0.7))
+    for yaw in (0.0, 2.0):
+        turn = jnp.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        rotation = camera_rotation(0.0, pitch, 0.0)
+        turned = dataclasses.replace(scene, walls=map_walls(segments @ np.asarray(turn[:2, :2]).T, keep=8))
+        seen = render_frame(position, turn @ rotation, lens, shown(turned, position, turn @ rotation, lens)).depth
+        right = render_frame(position, rotation, lens, dataclasses.replace(scene, boxes=every, walls=None)).depth
+        assert (np.abs(seen - right) > 0.05).mean() < 0.005
+        assert float(right[-1, 0]) < 1.0  # the pillar
 
 
 def test_starts_and_goals_are_free_and_a_way_apart():
@@ -294,6 +326,18 @@ def test_the_command_writes_a_picture_and_the_walls(tmp_path):
         assert done.returncode == 2 and message in done.stderr and len(done.stderr.strip().splitlines()) == 1
 
 
+def test_the_command_asks_for_the_room_of_the_vehicle_that_is_named(tmp_path, capsys):
+    def clearances(**options):
+        maps.main(maps.Import(Path("made:0"), tmp_path / "scene", pixels=100, **options))
+        return next(line for line in capsys.readouterr().out.splitlines() if line.startswith("clearance"))
+
+    assert clearances() == "clearance for whill_cr: 0.45 m on the way, 0.95 m at start and goal"
+    assert clearances(vehicle="warthog") == "clearance for warthog: 0.86 m on the way, 1.08 m at start and goal"
+    assert clearances(vehicle="create", width=0.6) == "clearance for create: 0.3 m on the way, 0.4 m at start and goal"
+    with pytest.raises(OptionError, match="unknown vehicle 'nothing'"):
+        clearances(vehicle="nothing")
+
+
 @pytest.mark.parametrize(("metre", "length"), [(110.0, 2.0), (4.0, 50.0), (700.0, 0.2)])
 def test_the_legend_of_a_map_has_a_bar_of_its_scale(metre, length):
     strip = picture._legend(1100, metre)
@@ -326,6 +370,18 @@ def test_maps_side_by_side_keep_their_walls_places_and_ways():
     places = ways.points.reshape(-1, 2)[listed]
     assert len(listed) and np.all(np.hypot(*(places - ways.start[-1]).T) <= 10.0 + 1e-3)
     assert side_by_side(made[:1]).walls is made[0].walls
+
+
+def test_people_see_each_point_of_their_way_from_the_one_before_and_go_back_at_its_end():
+    made = make_map_scene(read_map("made:0"))
+    points = draw_ways(made.grid, made.space, made.places.start, 1.5, 10.0).points.astype(float)
+    legs = np.diff(points, axis=1)
+    length = np.linalg.norm(legs, axis=-1)
+    assert length.min() > 0.1 and length.max() < SPACING + 1e-3
+    places = (points[:, :-1, None] + np.linspace(0, 1, 9)[:, None] * legs[:, :, None]).reshape(-1, 1, 2)
+    start, way = made.walls.segments[:, 0], made.walls.segments[:, 1] - made.walls.segments[:, 0]
+    share = np.clip(((places - start) * way).sum(-1) / (way**2).sum(-1), 0, 1)
+    assert np.linalg.norm(start + share[..., None] * way - places, axis=-1).min() > 0.04
 
 
 def written_map(folder, origin, cells=None):
@@ -377,8 +433,22 @@ def test_maps_of_other_places_come_side_by_side_and_not_kilometres_apart():
     group = side_by_side(made)
     assert np.ptp(group.walls.segments.reshape(-1, 2), 0)[1] == pytest.approx(np.ptp(made[0].walls.segments[..., 1]))
     np.testing.assert_allclose(group.places.start[-1, :2] - group.shifts[1], made[1].places.start[-1, :2], atol=1e-6)
+    vast = dataclasses.replace(made[0].walls, segments=40 * made[0].walls.segments)
     with pytest.raises(ValueError, match=r"80 maps side by side reach 4\d\d\d m from zero.*Name fewer maps"):
-        side_by_side([made[0]] * 80)
+        side_by_side([dataclasses.replace(made[0], walls=vast)] * 80)
+
+
+def test_many_maps_lie_in_rows_around_zero_and_none_on_another():
+    """A pose has steps of 0.02 mm there; in one row they would be ten times as long, and a slow vehicle would stand."""
+    made = make_map_scene(read_map("made:0"), Reach(farthest=6.0))
+    group = side_by_side([made] * 60)
+    corners = [made.walls.segments.reshape(-1, 2) + shift for shift in group.shifts]
+    assert np.abs(group.walls.segments).max() < 256.0
+    for number, one in enumerate(corners):
+        for other in corners[number + 1 :]:
+            assert (np.maximum(one.min(0) - other.max(0), other.min(0) - one.max(0)) > GAP - 1e-3).any()
+    starts = made.places.start[None, :, :2] + group.shifts[:, None]
+    np.testing.assert_allclose(group.places.start[:, :2], starts.reshape(-1, 2), atol=1e-9)
 
 
 LONG = dataclasses.replace(WHILL_CR, name="long", body_length=4.2, body_width=1.1)

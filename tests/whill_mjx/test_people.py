@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 from whill_mjx.world.collision import distances, from_above
+from whill_mjx.world.gallery import gallery
 from whill_mjx.world.lidar import first_hits
+from whill_mjx.world.materials import label_count
 from whill_mjx.world.people import body, law
 from whill_mjx.world.people.around import near_in
 from whill_mjx.world.people.contact import poses_among_people, scene_with_people, walk_around
 from whill_mjx.world.people.crowd import Crowd, join, people_on, scripted
 from whill_mjx.world.people.places import in_sight
 from whill_mjx.world.scene import Footprint, Marker, Scene, box, default_looks, no_boxes, stack_boxes
+from whill_mjx.world.solids import Solids, rod, stack_rounds
 
 pytestmark = pytest.mark.quick
 HALF = 0.4925, 0.277
@@ -133,6 +136,21 @@ def test_people_stay_out_of_walls_and_boxes():
     assert float(jnp.where(found.mask, apart, 9.0).min()) > law.RADIUS - 0.01
     gone = jnp.linalg.norm(jnp.diff(steps.position, axis=0), axis=-1)
     assert float(gone.sum(0)[people.there].min()) > 5.0  # nobody is stuck
+
+
+def test_people_come_into_a_scene_with_textures_and_lamps():
+    scene = gallery()
+    for count in (4, 8):
+        scene = scene_with_people(scene, join(walker([0.0, 0.0], [1.0, 0.0])), jax.random.key(0))
+        assert scene.finish.texture.shape == scene.finish.scale.shape == (label_count(scene),)
+        assert scene.solids.rounds.mask.shape[0] - gallery().solids.rounds.mask.shape[0] == count
+
+
+def test_what_hangs_above_heads_is_walked_under():
+    rods = stack_rounds([rod((3.0, -1.0, z), (3.0, 1.0, z), 0.1, (0.5,) * 3) for z in (1.0, 2.4)])
+    near = near_in(dataclasses.replace(EMPTY, solids=Solids(None, rods)))(jnp.array([[2.0, 0.0]]))
+    assert list(np.asarray(near.mask)[0, -2:]) == [True, False]
+    np.testing.assert_allclose(near.point[0, -2], [2.9, 0.0], atol=1e-5)
 
 
 @pytest.mark.long

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, observe, reset_state, sense, step_state
-from whill_mjx.evaluation.rerun_log import RerunLog, load_rerun
+from whill_mjx.evaluation.rerun_log import RerunLog, _capsules, load_rerun
 from whill_mjx.gym import WhillEnv
 from whill_mjx.gym.kinds import info_names
 from whill_mjx.io.command_line import OptionError
@@ -30,6 +31,7 @@ from whill_mjx.world.maps.walls import map_walls
 from whill_mjx.world.people.contact import scene_with_people
 from whill_mjx.world.people.crowd import scripted
 from whill_mjx.world.scene import no_boxes, stack_boxes
+from whill_mjx.world.solids import rod, stack_rounds
 
 quick, long = pytest.mark.quick, pytest.mark.long
 
@@ -186,6 +188,18 @@ def test_a_recording_has_chair_camera_scan_people_way_and_rewards(following, tmp
     assert data[:4] == b"RRF2" and len(data) > 10_000 and rerun.__version__
     for name in ("chair", "camera", "scan", "people", "way", "reward"):
         assert name.encode() in data
+
+
+@quick
+def test_a_rod_of_any_direction_stands_in_a_recording_where_it_is_hit():
+    ends = np.array([[[0, 0, 2], [0, 0, 0]], [[1, 0, 0.3], [2, 1, 0.3]], [[0, 1, 1], [0.5, 2, 0]]], np.float32)
+    shown = _capsules(SimpleNamespace(Capsules3D=lambda **fields: fields),
+                      stack_rounds([rod(*one, 0.1, (0.5, 0.5, 0.5)) for one in ends]))  # fmt: skip
+    x, y, _, w = shown["quaternions"].T
+    along = np.stack([2 * w * y, -2 * w * x, w**2 - x**2 - y**2], 1)  # of z, turned
+    found = np.stack([shown["translations"], shown["translations"] + shown["lengths"][:, None] * along], 1)
+    swapped = np.abs(found[:, 0] - ends[:, 0]).max(-1, keepdims=True)[..., None] > 1e-3
+    np.testing.assert_allclose(np.where(swapped, found[:, ::-1], found), ends, atol=1e-5)
 
 
 @quick

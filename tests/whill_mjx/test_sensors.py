@@ -109,6 +109,14 @@ def test_a_scan_meets_boxes_at_its_height_and_turns_with_the_vehicle():
     np.testing.assert_allclose(lidar.mirrored(jnp.arange(4.0)), [3, 2, 1, 0])
 
 
+@pytest.mark.quick
+def test_a_scanner_beside_the_middle_has_no_mirror():
+    """Its scan, turned round, is that of a scanner on the other side."""
+    aside = [Lidar(y=0.2), Lidar(yaw=-0.8), Lidar(period=0.1), Lidar3D(y=-0.1), Lidar3D(period=0.1)]
+    assert all(sensor.mirrored is None for sensor in aside)
+    assert all(sensor.mirrored is not None for sensor in (Lidar(x=0.3, fov=2.0), Lidar(yaw=np.pi), Lidar3D(z=1.0)))
+
+
 def test_the_vehicles_sensors_agree_with_its_motion():
     sensors = {"goal": Goal(), "odometry": Odometry(), "imu": Imu(), "commands": Commands(2)}
     env, params = make_env("obstacle_course", "whill_cr", layout="fixed", observations=sensors)

@@ -11,6 +11,9 @@ from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, repainted, reset_state, step_state
 from whill_mjx.learning.setup import TRUTH, functional_env, mirror_of
 from whill_mjx.sensors import privileged
+from whill_mjx.sensors.camera import Camera
+from whill_mjx.sensors.depth import Depth
+from whill_mjx.sensors.goal import Goal
 from whill_mjx.world.collision import obstacles_of, touches
 from whill_mjx.world.maps.walls import map_walls
 from whill_mjx.world.scene import box, footprint, no_boxes, stack_boxes
@@ -147,6 +150,19 @@ def test_the_mirror_shows_what_is_seen_and_known_in_the_mirrored_world():
     difference = np.abs(np.asarray(mirror.obs(None, images[0][None], 1)[0, 0], int) - images[1])
     assert images[0].std() > 10 and np.abs(images[0].astype(int) - images[1]).mean() > 5
     assert (difference > 3).mean() < 0.02  # only pixels on an edge
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("mount", [{"y": 0.1}, {"yaw": 0.3}, {"roll": 0.1}])
+def test_what_a_camera_beside_the_middle_sees_has_no_mirror(mount):
+    spec = ENV.model.spec
+    spec = dataclasses.replace(spec, camera=dataclasses.replace(spec.camera, **mount))
+    aside = dataclasses.replace(ENV, model=dataclasses.replace(ENV.model, spec=spec))
+    for sensors in ((), (("camera", Camera()), ("goal", Goal())), (("depth", Depth(as_bytes=True)),)):
+        assert mirror_of(make_batch(dataclasses.replace(ENV, sensors=sensors), PARAMS, 1)) is not None
+        assert mirror_of(make_batch(dataclasses.replace(aside, sensors=sensors), PARAMS, 1)) is None
+    for one in (Goal(), Camera(mount=ENV.model.spec.camera)):  # nothing is seen through that camera
+        assert mirror_of(make_batch(dataclasses.replace(aside, sensors=(("one", one),)), PARAMS, 1)) is not None
 
 
 @pytest.mark.long

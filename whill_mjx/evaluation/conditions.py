@@ -95,14 +95,19 @@ def _with_obstacles(condition: Condition, scene: Scene, walls: int) -> Scene:
 
 def _lit(condition: Condition, scene: Scene) -> Scene:
     """Scene under all of its light times a factor."""
-    looks, light, rich = scene.looks, condition.light, scene.rich
+    looks, light, rich, finish = scene.looks, condition.light, scene.rich, scene.finish
     if rich is not None:
         # Exposure control would divide a factor on the lamps out again, so the factor is on what the film gets after
         # it. Its pixels are the root of linear light.
         eye = dataclasses.replace(rich.eye, white=rich.eye.white * jnp.sqrt(light))
         return dataclasses.replace(scene, rich=dataclasses.replace(rich, eye=eye))
+    if finish is not None:
+        finish = dataclasses.replace(
+            finish, lamp_colour=finish.lamp_colour * light, fog_colour=jnp.clip(finish.fog_colour * light, 0.0, 1.0)
+        )
     return dataclasses.replace(
         scene,
+        finish=finish,
         looks=dataclasses.replace(
             looks,
             ambient=looks.ambient * light,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -30,7 +31,7 @@ BLINDS = ("blank", "freeze", "replay")
 SHARES = ("success", "collision", "timeout", "diverged")
 MEANS = {
     "return": "sum of the rewards",
-    "min_clearance_m": "smallest distance to a box or wall",
+    "min_clearance_m": "smallest distance to a box or wall, of the episodes that came near one",
     "path_length_m": "way of the driven-axle centre",
     "mean_speed_m_s": "path length by time",
     "command_change_rad_s2": "mean absolute change of the commanded yaw rate per time",
@@ -231,9 +232,16 @@ def summarise(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, Any]:
         summary[f"{name}_interval_95"] = list(bootstrap_interval(values)) if len(values) else None
     summary["return_sd"] = float(figures["return"].std())
     summary["episodes_with_near_miss"] = float((figures["near_misses"] > 0).mean())
-    quantiles = np.quantile(figures["min_clearance_m"], [0.01, 0.05, 0.5])
-    summary["min_clearance_m_quantiles"] = dict(zip(("0.01", "0.05", "0.5"), map(float, quantiles), strict=True))
+    nearest = np.sort(figures["min_clearance_m"])
+    summary["min_clearance_m_quantiles"] = {name: _quantile(nearest, float(name)) for name in ("0.01", "0.05", "0.5")}
     return summary
+
+
+def _quantile(ordered: np.ndarray, share: float) -> float | None:
+    """Quantile of values (N,) in rising order, between two of them; None where one is infinite, as far from all."""
+    place = share * (len(ordered) - 1)
+    two = ordered[int(place) : math.ceil(place) + 1]
+    return float(two[0] + place % 1.0 * (two[-1] - two[0])) if np.isfinite(two).all() else None
 
 
 def _mean(values: np.ndarray) -> float | None:

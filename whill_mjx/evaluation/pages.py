@@ -9,38 +9,69 @@ from typing import Any
 import jax
 import numpy as np
 
-from whill_mjx.evaluation.episodes import MEANS, OF_SUCCESSES, SHARES, Episodes
+from whill_mjx.evaluation.episodes import MEANS, OF_SUCCESSES, SHARES, Episodes, shares_of
 from whill_mjx.evaluation.pictures import _corners, _pyplot, _save
 from whill_mjx.evaluation.sweeps import Sweep
 from whill_mjx.io import html
 from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.video import write_h264
+from whill_mjx.world.collision import from_above
 
 ENDINGS = {"success": "tab:green", "collision": "tab:red", "timeout": "tab:orange", "diverged": "black"}
 
+OWN = "tab:purple"
+"""Colour of the endings that a task adds."""
 ENDED = {"success": "arrived", "collision": "collision", "timeout": "time-out", "diverged": "diverged"}
 """Words for how an episode ended."""
+LANE = np.array([-1.0, -2.2]), np.array([1.6, 2.2])
+"""Corners of the picture of a lane: the first from the start, the second from the goal's x and the middle [m]."""
+AROUND = 1.5
+"""What other pictures show around path and goal [m]."""
 
 
 def ending(episodes: Episodes, index: int) -> str:
     """How an episode ended."""
-    return next((name for name in ENDINGS if episodes.ends[name][index] > 0.5), "timeout")
+    return next((name for name in shares_of(episodes) if episodes.ends[name][index] > 0.5), "timeout")
 
 
-def draw_scene(axes: Any, scene: Any, goal_radius: float) -> None:
-    """Boxes and goal of one scene from above."""
-    boxes = scene.boxes
+def _ended(how: str) -> str:
+    return ENDED.get(how, how.replace("_", " "))
+
+
+def draw_scene(axes: Any, scene: Any, goal_radius: float, path: np.ndarray) -> None:
+    """Boxes, walls, round things and goal of one scene from above, around a path (T, 2) [m]."""
+    boxes, pyplot = scene.boxes, _pyplot()
     for box in range(boxes.yaw.shape[0]):
         if boxes.mask[box]:
             corners = _corners(boxes.centre[box], boxes.half[box], float(boxes.yaw[box]))
             axes.fill(corners[:, 0], corners[:, 1], color=np.clip(boxes.colour[box], 0, 1))
-    goal = scene.marker.position
-    axes.add_patch(_pyplot().Circle((goal[0], goal[1]), goal_radius, fill=False, color="tab:blue", linestyle=":"))
+    if scene.walls is not None:
+        from matplotlib.collections import LineCollection
+
+        axes.add_collection(LineCollection(list(scene.walls.segments), colors="dimgrey", linewidths=1.0))
+    if scene.solids is not None and scene.solids.rounds is not None:
+        rounds = jax.tree.map(np.asarray, from_above(scene.solids.rounds))
+        for number in np.flatnonzero(rounds.mask):
+            colour = np.clip(scene.solids.rounds.colour[number], 0, 1)
+            for end in (rounds.start[number], rounds.end[number]):
+                axes.add_patch(pyplot.Circle(end, rounds.radius[number], color=colour))
+    goal = np.asarray(scene.marker.position[:2])
+    axes.add_patch(pyplot.Circle(goal, goal_radius, fill=False, color="tab:blue", linestyle=":"))
     axes.plot([goal[0]], [goal[1]], "s", color="tab:blue", markersize=4)
-    axes.set_xlim(-1.0, float(goal[0]) + 1.6)
-    axes.set_ylim(-2.2, 2.2)
+    low, high = _frame(path, goal)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal")
+
+
+def _frame(path: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (2,) of a picture: those of a lane where it holds path and goal, else `AROUND` them."""
+    low, high = LANE[0], LANE[1] + [goal[0], 0.0]
+    points = np.vstack([path[np.isfinite(path).all(-1)], goal])  # of one that diverged, what is there
+    if (points >= low).all() and (points <= high).all():
+        return low, high
+    return points.min(0) - AROUND, points.max(0) + AROUND
 
 
 def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: int = 12, columns: int = 4) -> Path:
@@ -55,11 +86,12 @@ def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: i
         axes.set_axis_off()
         if index >= count:
             continue
-        draw_scene(axes, jax.tree.map(lambda leaf, i=index: leaf[i], episodes.scene), goal_radius)
-        how, rows_driven = ending(episodes, index), slice(0, length[index] + 1)
-        axes.plot(x[index, rows_driven], y[index, rows_driven], "-", color=ENDINGS[how], linewidth=1.5)
-        axes.plot(x[index, length[index]], y[index, length[index]], "o", color=ENDINGS[how], markersize=3)
-        axes.set_title(f"{ENDED[how]}, {episodes.ends['time_s'][index]:.1f} s", fontsize=8, color=ENDINGS[how])
+        how, path = ending(episodes, index), np.stack([x[index], y[index]], -1)[: length[index] + 1]
+        draw_scene(axes, jax.tree.map(lambda leaf, i=index: leaf[i], episodes.scene), goal_radius, path)
+        colour = ENDINGS.get(how, OWN)
+        axes.plot(*path.T, "-", color=colour, linewidth=1.5)
+        axes.plot(*path[-1], "o", color=colour, markersize=3)
+        axes.set_title(f"{_ended(how)}, {episodes.ends['time_s'][index]:.1f} s", fontsize=8, color=colour)
         _scale_bar(axes)
     figure.get_layout_engine().set(h_pad=0.12)
     _legend(figure, {ending(episodes, index) for index in range(count)}, min(3, columns))
@@ -78,8 +110,8 @@ def _legend(figure: Any, endings: set[str], columns: int) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Any] = [Line2D([], [], color=colour, label=f"path: {ENDED[how]}")
-                          for how, colour in ENDINGS.items() if how in endings]  # fmt: skip
+    ordered = [*(how for how in ENDINGS if how in endings), *sorted(endings - set(ENDINGS))]
+    handles: list[Any] = [Line2D([], [], color=ENDINGS.get(how, OWN), label=f"path: {_ended(how)}") for how in ordered]
     handles += [
         Line2D([], [], color="grey", marker="o", linestyle="", markersize=4,
                label="last position of the drive axle; the body reaches further"),
@@ -143,7 +175,7 @@ def sweep_paths(sweep: Sweep, out: Path, goal_radius: float) -> Path:
                                 figsize=(2.6 * shape[1] + 0.4, 1.9 * shape[0] + 0.3))
     labels = itertools.product(*([f"{axis.name} {label}" for label in axis.labels] for axis in sweep.axes))
     for index, ((paths, scene), label, axes) in enumerate(zip(sweep.paths, labels, grid.flat, strict=True)):
-        draw_scene(axes, scene, goal_radius)
+        draw_scene(axes, scene, goal_radius, paths.reshape(-1, 2))
         for path in paths:
             axes.plot(path[:, 0], path[:, 1], color="tab:purple", linewidth=0.6, alpha=0.5)
         axes.set_title(f"{', '.join(label)}: {100 * sweep.figures['success'].flat[index]:.0f} %", fontsize=7)
@@ -165,13 +197,14 @@ def episode_video(
         scale: enlargement.
     """
     colours = {"success": (40, 160, 60), "collision": (210, 40, 40), "timeout": (240, 150, 30), "diverged": (0, 0, 0)}
+    own = 148, 103, 189
 
     def tile(index: int, length: int, step: int) -> np.ndarray:
         row = min(step, length)
         shown = np.concatenate([frames[index, row], above[index, row]]).repeat(scale, 0).repeat(scale, 1)
         if step >= length:
             for edge in (np.s_[:6], np.s_[-6:], np.s_[:, :6], np.s_[:, -6:]):
-                shown[edge] = colours[ending(episodes, index)]
+                shown[edge] = colours.get(ending(episodes, index), own)
         return shown
 
     steps = range(int(episodes.length.max()) + round(rate_hz))
@@ -238,9 +271,11 @@ def _sight(seeing: dict[str, Any], blind: list[dict[str, Any]]) -> str:
 def _figures(drivers: dict[str, Any]) -> str:
     first = next(iter(drivers.values()))
     rows: list[list[Any]] = []
-    for name in (name for name in WORDS if f"{name}_interval_95" in first):
-        cells = [_with_interval(name, one[name], one[f"{name}_interval_95"]) for one in drivers.values()]
-        rows.append([WORDS[name], *cells])
+    measured = [name.removesuffix("_interval_95") for name in first if name.endswith("_interval_95")]
+    own = [name for name in measured if name not in WORDS]  # endings of the task
+    for name in (*SHARES, *own, *(name for name in WORDS if name in measured and name not in SHARES)):
+        cells = [_with_interval(name, one.get(name), one.get(f"{name}_interval_95")) for one in drivers.values()]
+        rows.append([WORDS.get(name, _ended(name)), *cells])
     return html.table(["figure", *map(_driver, drivers)], rows, "in brackets: the 95% interval")
 
 
@@ -267,7 +302,7 @@ def _caption(path: Path) -> str:
 def _shown(name: str, value: float | None) -> str:
     if value is None:
         return "–"
-    return percent(value) if name in SHARES else html.number(float(value))
+    return html.number(float(value)) if name in {*MEANS, *OF_SUCCESSES} else percent(value)
 
 
 def _with_interval(name: str, value: float | None, interval: list[float] | None) -> str:

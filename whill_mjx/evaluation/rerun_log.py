@@ -20,8 +20,10 @@ from whill_mjx.vehicle.kinematics import camera_pose, reference_pose
 from whill_mjx.vehicle.types import VehicleParams
 from whill_mjx.world.lidar import first_hits
 from whill_mjx.world.people import body
+from whill_mjx.world.people.contact import scene_without_people
 from whill_mjx.world.render import pinhole
 from whill_mjx.world.scene import Scene, footprint
+from whill_mjx.world.solids import Rounds
 
 TIMELINE = "time"
 FAR = 10.0
@@ -86,6 +88,9 @@ class RerunLog:
         self._log("world/boxes", _boxes(rr, scene))
         if scene.walls is not None:
             self._log("world/walls", rr.LineStrips3D(_outlines(scene), colors=[WALL], radii=0.01))
+        standing = scene_without_people(scene).solids
+        if standing is not None and standing.rounds is not None:
+            self._log("world/rounds", _capsules(rr, standing.rounds))
         marker = jax.tree.map(np.asarray, scene.marker)
         self._log("world/goal", rr.Boxes3D(
             centers=[marker.position], half_sizes=[marker.half], colors=[_bytes(marker.colour)],
@@ -113,8 +118,8 @@ class RerunLog:
             focal_length=[float(lens.fx), float(lens.fy)], width=env.width, height=env.height,
             camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.4))  # fmt: skip
         self._log("world/camera/image", rr.Image(seen["image"]))
-        if state.scene.people is not None:
-            self._log("world/people", _capsules(rr, state.scene))
+        if state.scene.people is not None and state.scene.solids is not None:
+            self._log("world/people", _capsules(rr, body.own_rounds(state.scene.solids, state.scene.people)))
         for name, value in (rewards or {}).items():
             self._log(f"reward/{name}", rr.Scalars([float(value)]))
         self._log("speed/v", rr.Scalars([float(seen["twist"][0])]))
@@ -200,18 +205,18 @@ def _outlines(scene: Scene) -> np.ndarray:
     return np.stack([np.concatenate([place, z], 1) for place, z in corners], 1)
 
 
-def _capsules(rr: ModuleType, scene: Scene) -> Any:
-    assert scene.people is not None and scene.solids is not None
-    rounds = jax.tree.map(np.asarray, body.own_rounds(scene.solids, scene.people))
-    foot = rounds.centre - rounds.half[:, None] * rounds.axis  # Rerun's capsule begins at its origin and goes along z
+def _capsules(rr: ModuleType, rounds: Rounds) -> Any:
+    """Cylinders and capsules, all with round ends."""
+    rounds = jax.tree.map(np.asarray, rounds)
     there = rounds.mask
-    axis = rounds.axis[there]
-    # The quaternion x, y, z, w that turns z into the axis, whose z is never -1.
+    axis = rounds.axis[there] * np.where(rounds.axis[there, 2:] < 0.0, -1.0, 1.0)
+    foot = rounds.centre[there] - rounds.half[there, None] * axis  # Rerun's capsule begins at its origin, along z
+    # The quaternion x, y, z, w that turns z into the axis, which points upwards.
     quaternion = np.column_stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis)), 1.0 + axis[:, 2]])
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     return rr.Capsules3D(
-        lengths=2 * rounds.half[there], radii=rounds.radius[there], translations=foot[there], quaternions=quaternion,
-        colors=_bytes(rounds.colour[there]), fill_mode="solid",
+        lengths=2 * rounds.half[there], radii=rounds.radius[there], translations=foot, quaternions=quaternion,
+        colors=_bytes(np.asarray(rounds.colour)[there]), fill_mode="solid",
     )  # fmt: skip
 
 

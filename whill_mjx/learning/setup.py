@@ -27,6 +27,7 @@ from whill_mjx.learning import ppo
 from whill_mjx.learning.ppo import PpoConfig
 from whill_mjx.learning.shaping import Safety, Step, limit_action, limited_policy, penalty
 from whill_mjx.sensors import privileged
+from whill_mjx.sensors.camera import is_aside
 from whill_mjx.tasks.tasks import Budget, Task, make_task
 from whill_mjx.vehicle.types import TimeStep
 from whill_mjx.vehicle.vehicle_file import load_intervals
@@ -379,7 +380,13 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
 
 
 def mirror_worlds(env: Env) -> int:
-    """Other worlds that the mirror of an environment shows at most; 0 where it has none."""
+    """Other worlds that the mirror of an environment shows at most; 0 where it has none.
+
+    What the vehicle's camera sees has a mirror where it looks along the vehicle's middle.
+    """
+    through_it = [one for _, one in env.sensors if one.visual and getattr(one, "mount", None) is None]
+    if is_aside(env.model.spec.camera) and (through_it or not env.sensors):
+        return 0
     if env.sensors:
         return int(all(sensor.mirrored is not None for _, sensor in env.sensors))
     return PAINTS if env.repaints else 1

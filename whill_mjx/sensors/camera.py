@@ -54,6 +54,9 @@ class Camera(Sensor):
     @property
     def mirrored(self) -> Callable[[jax.Array], jax.Array] | None:  # type: ignore[override]
         """Left and right exchanged; None of a further camera that does not look along the vehicle's middle."""
-        mount = self.mount
-        aside = mount is not None and (mount.y or mount.roll or math.remainder(mount.yaw, math.pi))
-        return None if aside else lambda value: value[..., ::-1, :]
+        return None if self.mount and is_aside(self.mount) else lambda value: value[..., ::-1, :]
+
+
+def is_aside(mount: CameraMount) -> bool:
+    """Whether a camera does not look along the vehicle's middle, so that its mirrored image is that of another one."""
+    return bool(mount.y or mount.roll or math.remainder(mount.yaw, math.pi))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -68,8 +69,11 @@ class Lidar(Sensor):
             return memory, jnp.minimum(found, self.reach)
         return memory, disturbed(found, key, self.noise, self.dropouts, self.nearest, self.reach)
 
-    def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
-        return value[..., ::-1]
+    @property
+    def mirrored(self) -> Callable[[jax.Array], jax.Array] | None:  # type: ignore[override]
+        """Left and right exchanged; None of a scanner beside the vehicle's middle, or that scans from right to left."""
+        aside = self.y or self.period or math.remainder(self.yaw, math.pi)
+        return None if aside else lambda value: value[..., ::-1]
 
 
 def distances(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -83,5 +84,7 @@ class Lidar3D(Sensor):
         strength = jnp.where(far < self.reach, jnp.clip(found.albedo * found.cosine, 0.0, 1.0), 0.0)
         return memory, jnp.stack([far, strength], -1).reshape(self.rings, self.rays, 2)
 
-    def mirrored(self, value: jax.Array) -> jax.Array:  # type: ignore[override]
-        return value[..., ::-1, :]
+    @property
+    def mirrored(self) -> Callable[[jax.Array], jax.Array] | None:  # type: ignore[override]
+        """Left and right exchanged; None of a scanner beside the vehicle's middle, or that scans from right to left."""
+        return None if self.y or self.period else lambda value: value[..., ::-1, :]

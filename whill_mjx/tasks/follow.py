@@ -17,6 +17,7 @@ from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.tasks.base import COMMON_SWEEPS, Budget, Task, World
 from whill_mjx.tasks.parts import OBSTACLES, make_marker, room
 from whill_mjx.tasks.terms import Moment, wrap
+from whill_mjx.world.maps.walls import distances_to
 from whill_mjx.world.people.contact import scene_with_people
 from whill_mjx.world.people.crowd import Crowd, people_on
 from whill_mjx.world.people.law import ARRIVED
@@ -86,11 +87,12 @@ class Follow(Task):
             place = jnp.clip(place + LEG * jnp.stack([jnp.cos(heading), jnp.sin(heading)]), -INSIDE, INSIDE)
             way.append(place)
         route = jnp.stack(way)
+        legs = jnp.stack([route[:-1], route[1:]], 1)
         boxes = [room(ROOM)]
         for number in range(self.pillars):
             x, y = draw(-5.0, 5.0, fixed=-4.0 + 2.0 * number), draw(-5.0, 5.0, fixed=4.5)
             turned, edge = draw(0.0, 1.5, fixed=0.0), draw(0.3, 0.6, fixed=0.4)
-            clear = jnp.minimum(_distance_to(route, x, y), jnp.hypot(x, y)) > BESIDE + edge
+            clear = jnp.minimum(distances_to(legs, x, y).min(), jnp.hypot(x, y)) > BESIDE + edge
             boxes.append(box(x, y, edge, edge, 1.6, jnp.array(OBSTACLES[number % len(OBSTACLES)]), turned, clear))
         pace = draw(self.slowest, self.fastest, fixed=0.7)
         person_key, dress_key = jax.random.split(key if self.randomised else jax.random.key(0))
@@ -140,11 +142,3 @@ class Follow(Task):
 
     def _lost(self, moment: Moment) -> jax.Array:
         return (moment.goal_distance > self.lost_at) & ~moment.collided
-
-
-def _distance_to(route: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """() m from a place to a way (W, 2)."""
-    start, way = route[:-1], route[1:] - route[:-1]
-    off = jnp.stack([x, y]) - start
-    share = jnp.clip(jnp.sum(off * way, -1) / jnp.maximum(jnp.sum(way**2, -1), 1e-9), 0.0, 1.0)
-    return jnp.min(jnp.linalg.norm(off - share[:, None] * way, axis=-1))

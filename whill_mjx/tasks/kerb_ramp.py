@@ -38,6 +38,7 @@ class KerbRamp(Task):
         Field("kerb_x", "m", 0.5, 1e3), Field("cut", "m", 0.01, 100.0, kind="numbers", count=2),
         Field("rise", "m", 0.001, 2.0, kind="numbers", count=2), Field("run", "-", 0.5, 1e3, kind="numbers", count=2),
     )  # fmt: skip
+    walls: ClassVar[int] = 3
     sweeps: ClassVar[tuple[str, ...]] = COMMON_SWEEPS
 
     v_min: float = -0.2

@@ -7,12 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.world.scene import BLUE as BLUE
+from whill_mjx.world.scene import CARDBOARD as CARDBOARD
+from whill_mjx.world.scene import WALL as WALL
 from whill_mjx.world.scene import Boxes, Marker, box, stack_boxes
 
-BLUE = (0.04, 0.16, 0.90)
-"""Of every goal marker."""
-WALL = (0.78, 0.76, 0.72)
-CARDBOARD = (0.62, 0.44, 0.26)
 OBSTACLES = ((0.78, 0.20, 0.16), (0.88, 0.58, 0.14), (0.26, 0.55, 0.24), (0.66, 0.46, 0.28))
 
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from whill_mjx.world.materials import ATLAS, label_count, make_atlas, plain_finish, texture_number
 from whill_mjx.world.render import camera_rotation, look_at
-from whill_mjx.world.scene import Marker, Scene, box, default_looks, stack_boxes
+from whill_mjx.world.scene import BLUE, CARDBOARD, WALL, Marker, Scene, box, default_looks, stack_boxes
 from whill_mjx.world.solids import Solids, block, person, post, rod, stack_blocks, stack_rounds
 
-CARDBOARD, WALL = (0.62, 0.44, 0.26), (0.78, 0.76, 0.72)
 FLOOR_TILE = 0.6
 """Side of a floor tile, by its colour and by its grout [m]."""
 
@@ -43,8 +42,7 @@ def gallery() -> Scene:
         post(2.6, 1.9, 1.0, 0.06, (0.90, 0.70, 0.10)),
         rod((3.0, -0.5, 0.12), (3.5, -0.2, 0.12), 0.12, (0.20, 0.50, 0.80), capsule=False),
     ])
-    half, blue = jnp.array([0.02, 0.3, 0.3]), jnp.array((0.04, 0.16, 0.9))
-    marker = Marker(jnp.array([8.9, 0.3, 1.05]), half, jnp.zeros(()), blue)
+    marker = Marker(jnp.array([8.9, 0.3, 1.05]), jnp.array([0.02, 0.3, 0.3]), jnp.zeros(()), jnp.array(BLUE))
     solids = Solids(stack_blocks([part for *_, part in blocks]), rounds)
     looks = dataclasses.replace(default_looks(), tile=jnp.array(FLOOR_TILE))
     scene = Scene(stack_boxes([part for *_, part in boxes]), marker, looks, solids)

@@ -17,6 +17,11 @@ from whill_mjx.world.materials import Finish
 from whill_mjx.world.people.crowd import People
 from whill_mjx.world.solids import Solids
 
+BLUE = (0.04, 0.16, 0.90)
+"""Of every goal marker."""
+WALL = (0.78, 0.76, 0.72)
+CARDBOARD = (0.62, 0.44, 0.26)
+
 
 @struct.dataclass
 class Boxes:

@@ -8,40 +8,63 @@ import numpy as np
 
 from whill_mjx.world.maps.coordinates import read_numbers, unreadable
 
-OUTER = ("outer", "outline", "")
-"""Roles of the ways around a building. `inner` are its courtyards; others, such as `part`, are no border of it."""
+OUTER, INNER = ("outer", "outline", ""), "inner"
+"""Roles of the ways around a building, and around its courtyards; others, such as `part`, are no border of it."""
 Place = tuple[float, float]
 
 
 def read_osm(root: ET.Element) -> tuple[list[list[np.ndarray]], list[str]]:
-    """Rings (n, 2) of latitude and longitude of every building, the outer one first, and notes on what is left out."""
+    """Rings (n, 2) of latitude and longitude of every building, the outer one first, and notes on what is missing."""
+    ways, short = _read_ways(root)
+    chosen: list[list[np.ndarray]] = []
+    cut: list[str] = []
+    drawn: list[str] = []  # without some of their corners
+    pieces: set[str | None] = set()  # ways of relations, whose outlines stand for them
+    for relation in filter(_is_building, root.iter("relation")):
+        roles, called = _roles(relation), f"relation {relation.get('id')}"
+        outlines, whole = _outlines(roles, ways)
+        chosen += outlines
+        pieces |= set(roles)
+        cut += [] if whole else [called]
+        borders = {ref for ref, role in roles.items() if role in (*OUTER, INNER)}
+        drawn += [called] if outlines and short & borders else []
+    around = {_corners(outline[0]) for outline in chosen}  # a way that has the tags of its relation, too
+    for way in filter(_is_building, root.iter("way")):
+        name = way.get("id")
+        if _is_closed(ring := ways.get(name, [])):
+            if frozenset(ring) not in around:
+                chosen.append([np.array(ring)])
+                drawn += [f"way {name}"] if name in short else []
+        elif name in ways and name not in pieces:
+            cut.append(f"way {name}")
+    notes = {"borders of buildings that are not whole in the file, left out": cut,
+             "borders of buildings with corners that are not in the file, drawn without them": drawn}  # fmt: skip
+    return chosen, [f"{what}: {_named(names)}" for what, names in notes.items() if names]
+
+
+def _read_ways(root: ET.Element) -> tuple[dict[str | None, list[Place]], set[str | None]]:
+    """Corners of every way by its id, and the ways of which some corners are not in the file."""
     places = {
         node.get("id"): _place(node)
         for node in root.iter("node")
         if node.get("visible") != "false" and node.get("lat")
     }
-    ways = {
-        way.get("id"): [place for one in way.iter("nd") if (place := places.get(one.get("ref")))]
-        for way in root.iter("way")
-        if way.get("visible") != "false"
-    }
-    chosen: list[list[np.ndarray]] = []
-    cut: list[str] = []
-    pieces: set[str | None] = set()  # ways of relations, whose outlines stand for them
-    for relation in filter(_is_building, root.iter("relation")):
-        outlines, whole = _outlines(relation, ways)
-        chosen += outlines
-        pieces |= {one.get("ref") for one in relation.iter("member")}
-        if not whole:
-            cut.append(f"relation {relation.get('id')}")
-    for way in filter(_is_building, root.iter("way")):
-        name = way.get("id")
-        if _is_closed(ring := ways.get(name, [])):
-            chosen.append([np.array(ring)])
-        elif name in ways and name not in pieces:
-            cut.append(f"way {name}")
-    shown = ", ".join(cut[:5]) + (f" and {len(cut) - 5} more" if len(cut) > 5 else "")
-    return chosen, [f"borders of buildings that are not whole in the file, left out: {shown}"] if cut else []
+    ways, short = {}, set()
+    for way in root.iter("way"):
+        if way.get("visible") != "false":
+            corners = [places.get(one.get("ref")) for one in way.iter("nd")]
+            ways[way.get("id")] = [place for place in corners if place]
+            if None in corners:
+                short.add(way.get("id"))
+    return ways, short
+
+
+def _corners(ring: np.ndarray) -> frozenset[Place]:
+    return frozenset((float(a), float(b)) for a, b in ring)
+
+
+def _named(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _place(node: ET.Element) -> Place:
@@ -61,11 +84,17 @@ def _is_closed(ring: list[Place]) -> bool:
     return len(ring) > 3 and ring[0] == ring[-1]
 
 
-def _outlines(relation: ET.Element, ways: dict[str | None, list[Place]]) -> tuple[list[list[np.ndarray]], bool]:
+def _roles(relation: ET.Element) -> dict[str | None, str]:
+    """Role of each way of a relation."""
+    return {one.get("ref"): one.get("role", "") for one in relation.iter("member") if one.get("type") == "way"}
+
+
+def _outlines(
+    roles: dict[str | None, str], ways: dict[str | None, list[Place]]
+) -> tuple[list[list[np.ndarray]], bool]:
     """Outer rings of a relation, each with its courtyards, and whether no piece of an outer ring was left over."""
-    roles = {one.get("ref"): one.get("role", "") for one in relation.iter("member") if one.get("type") == "way"}
     outer, whole = _joined([ways.get(ref, []) for ref, role in roles.items() if role in OUTER])
-    inner, _ = _joined([ways.get(ref, []) for ref, role in roles.items() if role == "inner"])
+    inner, _ = _joined([ways.get(ref, []) for ref, role in roles.items() if role == INNER])
     if not any(roles.values()):  # as old data has it: a ring within another one is its courtyard
         inner = [ring for ring in outer if any(_is_around(other, ring) for other in outer)]
         outer = [ring for ring in outer if not any(ring is one for one in inner)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,13 +77,21 @@ def clearances(space: np.ndarray, resolution: float) -> np.ndarray:
     return np.where(space, distance_transform_edt(padded)[1:-1, 1:-1] - 0.5, 0.0) * resolution
 
 
-def way_graph(grid: GridMap, space: np.ndarray, passing: float) -> tuple[np.ndarray, ...]:
-    """Ways in a map as a graph of points about `STEP` apart with enough clearance to pass.
+class WayGraph(NamedTuple):
+    """Ways in a map as a graph of points about `STEP` apart with enough clearance to pass."""
 
-    Returns:
-        Clearance of all cells, of the coarse cells, the rows and columns (P,) of those that are points, the points
-        (P, 2) in the world [m], and the graph (P, P) of distances between neighbours (scipy, sparse).
-    """
+    clear: np.ndarray
+    """(rows, columns) m: clearance of all cells."""
+    cells: np.ndarray
+    """(P, 2) row and column of each point."""
+    points: np.ndarray
+    """(P, 2) m, in the world."""
+    links: Any
+    """(P, P) m: distances between neighbours (scipy, sparse); each is there once."""
+
+
+def way_graph(grid: GridMap, space: np.ndarray, passing: float) -> WayGraph:
+    """Graph of the points of a space that have a clearance `passing` [m]."""
     from scipy.sparse import coo_array
 
     clear = clearances(space, grid.resolution)
@@ -101,9 +109,9 @@ def way_graph(grid: GridMap, space: np.ndarray, passing: float) -> tuple[np.ndar
         lengths.append(np.full(linked.sum(), np.hypot(down, right) * stride * grid.resolution))
     count = len(rows)
     tail, head, length = (np.concatenate(parts) for parts in (tails, heads, lengths))
-    graph = coo_array((length, (tail, head)), (count, count)).tocsr()
-    points = grid.to_world((np.stack([columns, rows], -1) * stride + stride // 2 + 0.5) * grid.resolution)
-    return clear, coarse, rows, columns, points, graph
+    cells = np.stack([rows, columns], -1) * stride + stride // 2
+    points = grid.to_world((cells[:, ::-1] + 0.5) * grid.resolution)
+    return WayGraph(clear, cells, points, coo_array((length, (tail, head)), (count, count)).tocsr())
 
 
 def draw_places(
@@ -116,14 +124,14 @@ def draw_places(
     """
     from scipy.sparse.csgraph import dijkstra
 
-    clear, coarse, rows, columns, points, graph = way_graph(grid, space, reach.passing)
-    standing = np.flatnonzero(coarse[rows, columns] >= reach.standing)
+    clear, cells, points, links = way_graph(grid, space, reach.passing)
+    standing = np.flatnonzero(clear[tuple(cells.T)] >= reach.standing)
     rng = np.random.default_rng(seed)
     starts, ends, ways = [], [], []
     longest = 0.0
     for goal in rng.permutation(standing)[:goals]:
         distance, before = dijkstra(  # a goal sees no farther than it needs to: a city has a million points
-            graph, directed=False, indices=goal, return_predecessors=True, limit=reach.farthest
+            links, directed=False, indices=goal, return_predecessors=True, limit=reach.farthest
         )
         far = distance[standing]
         longest = max(longest, float(far[np.isfinite(far)].max()))

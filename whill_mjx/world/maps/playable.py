@@ -20,10 +20,8 @@ from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
 from whill_mjx.world.maps.straight import connected, open_space, straight_walls
 from whill_mjx.world.maps.surfaces import CLOUDS, MESHES, load_surfaces
 from whill_mjx.world.maps.walls import SHOWN, map_walls
-from whill_mjx.world.scene import MapWalls, Marker, Scene, default_looks, no_boxes
+from whill_mjx.world.scene import BLUE, WALL, MapWalls, Marker, Scene, default_looks, no_boxes
 
-BLUE = (0.04, 0.16, 0.90)
-WALL = (0.78, 0.76, 0.72)
 MARKER_HALF, MARKER_HEIGHT = 0.3, 1.05
 """Half edge of the goal's square, and the height of its centre [m]."""
 TURNED = 0.3

@@ -1,7 +1,11 @@
-"""Several maps as one world: they lie side by side, so that one compiled program knows them all."""
+"""Several maps as one world: they lie side by side in rows around zero, so that one compiled program knows them all.
+
+Near zero, because poses are in single precision. Walls enclose the space of each map, so no ray leads to another one.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,8 +18,8 @@ from whill_mjx.world.maps.walls import map_walls
 from whill_mjx.world.maps.ways import POINTS, WAYS, Ways, draw_ways
 from whill_mjx.world.scene import MapWalls
 
-GAP = 30.0
-"""Distance between two maps, beyond the reach of scans [m]."""
+GAP = 10.0
+"""Distance between two maps, beyond what people and vehicles notice of walls [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +28,7 @@ class MapGroup:
 
     parts: tuple[MapScene, ...]
     shifts: np.ndarray
-    """(K, 2) m by which each map was moved; the first stays."""
+    """(K, 2) m by which each map was moved; a map alone stays."""
     walls: MapWalls
     places: Places
 
@@ -34,7 +38,6 @@ class MapGroup:
         return Ways(
             points=np.concatenate([one.points + shift for one, shift in zip(drawn, self.shifts, strict=True)])
             .astype(np.float32),
-            length=np.concatenate([one.length for one in drawn]),
             start=np.concatenate([one.start + shift for one, shift in zip(drawn, self.shifts, strict=True)])
             .astype(np.float32),
             near=np.concatenate([np.where(one.near >= 0, one.near + number * WAYS * POINTS, -1)
@@ -43,22 +46,16 @@ class MapGroup:
 
 
 def side_by_side(scenes: Sequence[MapScene]) -> MapGroup:
-    """A group of at least one map in a row along x; a single one stays as it is.
+    """A group of at least one map in rows, as many rows as maps in a row; a single one stays as it is.
 
     Raises:
-        ValueError: the row is too long.
+        ValueError: together they are too large.
     """
     first = scenes[0]
     if len(scenes) == 1:
         return MapGroup((first,), np.zeros((1, 2)), first.walls, first.places)
-    low, high = _span(first)
-    shifts = [np.zeros(2)]
-    for scene in scenes[1:]:
-        own_low, own_high = _span(scene)
-        beside = own_low[1] <= high[1] and low[1] <= own_high[1]
-        shifts.append(np.array([high[0] + GAP - own_low[0], 0.0 if beside else low[1] - own_low[1]]))
-        low, high = np.minimum(low, own_low + shifts[-1]), np.maximum(high, own_high + shifts[-1])
-    if (far := float(np.abs([low, high]).max())) > FARTHEST:
+    shifts, far = _laid_out(np.array([_span(scene) for scene in scenes]))
+    if far > FARTHEST:
         raise ValueError(f"{len(scenes)} maps side by side reach {far:.0f} m from zero; poses are in single precision, "
                          f"so they may reach {FARTHEST:g} m. Name fewer maps.")
     pairs = list(zip(scenes, shifts, strict=True))
@@ -69,10 +66,28 @@ def side_by_side(scenes: Sequence[MapScene]) -> MapGroup:
         goal=np.concatenate([one.places.goal + shift for one, shift in pairs]),
         way=np.concatenate([one.places.way for one in scenes]),
     )
-    return MapGroup(tuple(scenes), np.stack(shifts), walls, places)
+    return MapGroup(tuple(scenes), shifts, walls, places)
+
+
+def _laid_out(spans: np.ndarray) -> tuple[np.ndarray, float]:
+    """How far (K, 2) maps are moved [m], and the largest coordinate of all then [m].
+
+    `spans` (K, 2, 2) holds the least and the largest x, y [m] of each map.
+    """
+    columns = math.ceil(math.sqrt(len(spans)))
+    corners, row = [], 0.0
+    for begin in range(0, len(spans), columns):
+        sizes = spans[begin : begin + columns, 1] - spans[begin : begin + columns, 0]
+        lefts = np.cumsum([0.0, *(sizes[:-1, 0] + GAP)])
+        corners.append(np.column_stack([lefts, np.full(len(lefts), row)]))
+        row += sizes[:, 1].max() + GAP
+    low = np.concatenate(corners)
+    high = low + spans[:, 1] - spans[:, 0]
+    shifts = low - spans[:, 0] - high.max(0) / 2
+    return shifts, float(np.abs(spans + shifts[:, None]).max())
 
 
 def _span(scene: MapScene) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest x, y [m] of a map's walls."""
-    points = scene.walls.segments.reshape(-1, 2)
+    points = scene.walls.segments.reshape(-1, 2).astype(float)
     return points.min(0), points.max(0)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.world.render.camera import Intrinsics
-from whill_mjx.world.scene import Boxes, MapWalls, Scene
+from whill_mjx.world.scene import WALL, Boxes, MapWalls, Scene
 
 CLOSE = 1e-3
 """Depth at which a wall beside the camera is cut off [m]."""
@@ -27,6 +27,8 @@ SHOWN = 40
 SQUARE, NEAR = 0.5, 1.2
 """Edge of the squares that have lists of their walls, and how near a wall has to be for a wheelchair [m]; for other
 vehicles `whill_mjx.world.maps.places.reach_of` says it."""
+BESIDE, WIDEST = 8, 6.0
+"""Rays beyond the horizon's on each side of an image, and their largest slope to the camera's heading: 80 degrees."""
 THICKNESS = 0.002
 """Depth of a drawn wall, behind its face [m]."""
 
@@ -56,10 +58,11 @@ def _cast(segments: jax.Array, x, y, angles: jax.Array) -> tuple[jax.Array, jax.
     along, across = jnp.cos(angles)[:, None], jnp.sin(angles)[:, None]  # (R, 1)
     px, py = start[:, 0] - x, start[:, 1] - y
     turn = along * way[:, 1] - across * way[:, 0]  # (R, S)
-    turn = jnp.where(jnp.abs(turn) < 1e-9, 1e-9, turn)
+    edge = jnp.abs(turn) < 1e-9  # it is seen end on: the wall around its corner is met
+    turn = jnp.where(edge, 1e-9, turn)
     distance = (px * way[:, 1] - py * way[:, 0]) / turn
     share = (px * across - py * along) / turn
-    met = (share >= -1e-5) & (share <= 1.0 + 1e-5) & (distance >= 0.0)  # no ray slips through a corner
+    met = ~edge & (share >= -1e-5) & (share <= 1.0 + 1e-5) & (distance >= 0.0)  # no ray slips through a corner
     distance = jnp.where(met, distance, jnp.inf)
     index = jnp.argmin(distance, -1)
     return jnp.min(distance, -1), index.astype(jnp.int32)
@@ -69,7 +72,8 @@ def first_walls(segments: jax.Array, x: jax.Array, y: jax.Array, angles: jax.Arr
     """Index (R,) int32 of the wall that each ray from a place x, y meets first, for the columns of an image.
 
     A processor takes the walls in rounds, of which XLA makes one loop, with bearings as slopes: less than half a turn
-    may lie between the rays. Of two walls that are equally far to 1 in 1,000 it may take either.
+    may lie between the rays. Of two of S walls whose distances differ by less than S / 4,000,000 of them it may take
+    either.
     """
 
     def in_rounds(segments, x, y, angles):
@@ -152,7 +156,7 @@ def wall_boxes(segments: jax.Array, index: jax.Array, mask: jax.Array, height, c
     )
 
 
-def nearest_walls(segments: jax.Array, x, y, count: int, height: float = 2.0, colour=(0.78, 0.76, 0.72)) -> Boxes:
+def nearest_walls(segments: jax.Array, x, y, count: int, height: float = 2.0, colour=WALL) -> Boxes:
     """The `count` walls (S, 2, 2) nearest to a point as boxes; fewer than `count` leave unused boxes."""
     used = min(count, segments.shape[0])
     _, index = jax.lax.top_k(-distances_to(segments, x, y), used)
@@ -168,6 +172,27 @@ def distances_to(segments: jax.Array, x, y) -> jax.Array:
     return jnp.hypot(start[:, 0] + share * way[:, 0] - x, start[:, 1] + share * way[:, 1] - y)
 
 
+def bearings(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
+    """(width + 2 BESIDE,) rad: bearings in the world of all that an image shows, without lens distortion.
+
+    Those of the horizon's point in each column, and those that lie beyond them on both sides: a camera that looks down
+    sees more aside at its lower edge than on the horizon. At most `WIDEST` to either side of its heading.
+    """
+    columns = column_angles(rotation, intrinsics)
+    u = (jnp.array([0.0, intrinsics.width]) - intrinsics.cx) / intrinsics.fx
+    v = (jnp.array([0.0, intrinsics.height]) - intrinsics.cy) / intrinsics.fy
+    corner = rotation[:2, 0] * u[:, None, None] + rotation[:2, 1] * v[:, None] + rotation[:2, 2]  # (2, 2, 2)
+    ahead = rotation[:2, 2] + rotation[2, 2] * rotation[:2, 1]  # that of its upper edge where it looks straight down
+    c, s = ahead / jnp.maximum(jnp.linalg.norm(ahead), 1e-6)
+    deep, aside = corner[..., 0] * c + corner[..., 1] * s, corner[..., 1] * c - corner[..., 0] * s
+    slope = jnp.clip(aside / jnp.maximum(deep, 1e-6), -WIDEST, WIDEST)
+    heading, share = jnp.arctan2(s, c), (jnp.arange(BESIDE) + 1.0) / BESIDE
+    edges = jnp.clip(jnp.tan(columns[jnp.array([0, -1])] - heading), -WIDEST, WIDEST)
+    ends = jnp.stack([jnp.maximum(slope.max(), edges[0]), jnp.minimum(slope.min(), edges[1])])
+    beyond = edges[:, None] + (ends - edges)[:, None] * share
+    return jnp.concatenate([columns, (heading + jnp.arctan(beyond)).ravel()])
+
+
 def column_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
     """(width,) rad: bearing in the world of the horizon's point in each column of an image, without lens distortion."""
     u = (jnp.arange(intrinsics.width) + 0.5 - intrinsics.cx) / intrinsics.fx
@@ -181,13 +206,14 @@ def column_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
 def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: Intrinsics) -> Scene:
     """The scene with the walls of its map that this camera sees, in place of its last `keep` boxes.
 
-    One ray per image column, along the horizon, finds the nearest wall; a scene without a map stays as it is.
+    One ray per image column, along the horizon, and a few beyond it on both sides find the nearest walls; a scene
+    without a map stays as it is.
     """
     walls = scene.walls
     if walls is None:
         return scene
     segments = jnp.asarray(walls.segments)
-    index = first_walls(segments, position[0], position[1], column_angles(rotation, intrinsics))
+    index = first_walls(segments, position[0], position[1], bearings(rotation, intrinsics))
     index, mask = most_seen(index, walls.keep)
     fixed = scene.boxes.mask.shape[0] - walls.keep
     drawn = wall_boxes(segments, index, mask, walls.height, scene.boxes.colour[fixed])
@@ -203,9 +229,9 @@ def map_walls(segments: np.ndarray, keep: int = SHOWN, height: float = 2.2, near
     segments = np.asarray(segments, np.float32)
     low = segments.reshape(-1, 2).min(0) - near
     columns, rows = np.ceil((segments.reshape(-1, 2).max(0) + near - low) / SQUARE).astype(int)
-    lists: list[list[int]] = [[] for _ in range(rows * columns)]
     corner = SQUARE * np.array([[0.5, 0.5]])
     reach = near + SQUARE * 0.5**0.5
+    squares, numbers = [], []
     for number, (start, end) in enumerate(segments.astype(float)):
         first = np.maximum(np.floor((np.minimum(start, end) - low - near) / SQUARE).astype(int), 0)
         last = np.minimum(np.floor((np.maximum(start, end) - low + near) / SQUARE).astype(int), [columns - 1, rows - 1])
@@ -215,10 +241,13 @@ def map_walls(segments: np.ndarray, keep: int = SHOWN, height: float = 2.2, near
         way = end - start
         share = np.clip(((centre - start) @ way) / max(way @ way, 1e-12), 0.0, 1.0)
         close = np.hypot(*(start + share[:, None] * way - centre).T) <= reach
-        for place in (row * columns + column)[close]:
-            lists[place].append(number)
-    listed = np.full((len(lists), max(map(len, lists))), -1, np.int32)
-    for number, numbers in enumerate(lists):
-        listed[number, : len(numbers)] = numbers
+        squares.append((row * columns + column)[close])
+        numbers.append(np.full(close.sum(), number, np.int32))
+    square, wall = np.concatenate(squares), np.concatenate(numbers)
+    order = np.argsort(square, kind="stable")
+    count = np.bincount(square, minlength=rows * columns)
+    place = np.arange(len(square)) - (np.cumsum(count) - count)[square[order]]  # in the list of its square
+    listed = np.full((rows * columns, count.max()), -1, np.int32)
+    listed[square[order], place] = wall[order]
     lowest, shape = (float(low[0]), float(low[1])), (int(rows), int(columns))
     return MapWalls(segments, keep, height, listed, lowest, SQUARE, shape, near)

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.world.maps.grid import GridMap
-from whill_mjx.world.maps.places import way_graph
-from whill_mjx.world.people.crowd import Crowd, People, people_on
+from whill_mjx.world.maps.places import WayGraph, way_graph
+from whill_mjx.world.people.crowd import RADIUS, Crowd, People, people_on
+from whill_mjx.world.people.law import BUFFER
 from whill_mjx.world.people.places import chosen_apart
 
 WAYS, POINTS, SPACING = 128, 16, 1.5
-"""Ways of a map, points of each, and their distance along the way [m]."""
-PASSING = 0.3
-"""Clearance that people need on their way [m]."""
+"""Ways of a map, points of each, and the largest distance of two along the way [m]."""
+PASSING = RADIUS + BUFFER
+"""Clearance that people need on their way: no wall turns them aside [m]."""
 LISTED = 48
 """Points listed for each start."""
 
@@ -26,9 +27,7 @@ class Ways:
     """Shortest ways between far places. Static, and shared by all instances."""
 
     points: np.ndarray
-    """(R, W, 2) m; a shorter way stays at its last point."""
-    length: np.ndarray
-    """(R,) how many of its points differ."""
+    """(R, W, 2) m, each in sight of the next; a shorter way leads to and fro."""
     start: np.ndarray
     """(Q, 2) m, the vehicle's starts."""
     near: np.ndarray
@@ -40,29 +39,30 @@ def draw_ways(
 ) -> Ways:
     """Ways of up to POINTS points between random places of a space, and those near the starts (Q, 2) [m].
 
+    The places are those of the largest part of the space in which people get from everywhere to everywhere.
+
     Args:
         grid, space: of the map.
         starts: of the vehicle.
         clear, within: least and greatest distance of a listed point from the start [m].
         seed: of the draw.
     """
-    from scipy.sparse.csgraph import dijkstra
+    from scipy.sparse.csgraph import connected_components, dijkstra
 
-    *_, points, graph = way_graph(grid, space, PASSING)
+    graph = way_graph(grid, space, PASSING)
+    _, part = connected_components(graph.links, directed=False)
     rng = np.random.default_rng(seed)
     longest = SPACING * (POINTS - 1)
     rows, length = [], []
-    for origin in rng.integers(0, len(points), WAYS):
-        far, before = dijkstra(graph, directed=False, indices=origin, return_predecessors=True, limit=longest)
+    for origin in rng.choice(np.flatnonzero(part == np.bincount(part).argmax()), WAYS):
+        far, before = dijkstra(graph.links, directed=False, indices=origin, return_predecessors=True, limit=longest)
         reached = np.flatnonzero(np.isfinite(far))
         place = rng.choice(reached[far[reached] >= 0.5 * far[reached].max()])
         way = [place]
         while before[way[-1]] >= 0:
             way.append(before[way[-1]])
-        index = np.asarray(way)
-        marks = np.arange(0.0, far[place] + SPACING, SPACING).clip(max=far[place])
-        chosen = index[np.unique(np.searchsorted(-far[index], -(far[place] - marks)).clip(max=len(index) - 1))]
-        rows.append(points[np.pad(chosen, (0, POINTS - len(chosen)), mode="edge")])
+        chosen = _turning_points(graph, np.asarray(way), far)
+        rows.append(graph.points[np.pad(chosen, (0, POINTS - len(chosen)), mode="reflect")])
         length.append(len(chosen))
     ways = np.stack(rows)
     real = np.arange(POINTS) < np.asarray(length)[:, None]
@@ -73,7 +73,27 @@ def draw_ways(
         fits = np.flatnonzero((distance >= clear) & (distance <= within))
         listed = rng.permutation(fits)[:LISTED]
         near[number, : len(listed)] = flat[listed]
-    return Ways(ways.astype(np.float32), np.asarray(length, np.int32), starts[:, :2].astype(np.float32), near)
+    return Ways(ways.astype(np.float32), starts[:, :2].astype(np.float32), near)
+
+
+def _turning_points(graph: WayGraph, way: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Up to POINTS points of a way (n,), at most SPACING apart along it, of which each sees the next.
+
+    A line of sight has the room of a person, RADIUS. `far` (P,) is the distance of each point along the way [m].
+    """
+    chosen = [0]
+    while chosen[-1] < len(way) - 1 and len(chosen) < POINTS:
+        here = chosen[-1]
+        ahead = here + 1 + np.flatnonzero(far[way[here]] - far[way[here + 1 :]] <= SPACING)
+        seen = [one for one in ahead if _sees(graph, way[here], way[one])]
+        chosen.append(int(max(seen, default=here + 1)))
+    return way[chosen]
+
+
+def _sees(graph: WayGraph, one: int, other: int) -> bool:
+    a, b = graph.cells[one], graph.cells[other]
+    between = np.rint(np.linspace(a, b, np.abs(b - a).max() + 1)).astype(int)
+    return bool((graph.clear[tuple(between.T)] >= RADIUS).all())
 
 
 def people_near(key: jax.Array, ways: Ways, start: jax.Array, crowd: Crowd) -> People:

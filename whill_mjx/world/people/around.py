@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.world.collision import from_above
 from whill_mjx.world.people.law import Mover, Near
 from whill_mjx.world.scene import Boxes, Footprint, Scene
 from whill_mjx.world.solids import Rounds
@@ -53,13 +54,12 @@ def _on_segments(place: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arra
 
 
 def _on_rounds(place: jax.Array, rounds: Rounds) -> Near:
-    reach = rounds.half[:, None] * rounds.axis
-    start, end = (rounds.centre - reach)[:, :2], (rounds.centre + reach)[:, :2]
-    axis = _on_segments(place, start[None], end[None])
+    seen = from_above(rounds)
+    axis = _on_segments(place, seen.start[None], seen.end[None])
     away = place[:, None] - axis
     far = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
-    point = axis + away * (jnp.minimum(rounds.radius, far) / far)[..., None]
-    return Near(point, jnp.broadcast_to(rounds.mask, point.shape[:2]))
+    point = axis + away * (jnp.minimum(seen.radius, far) / far)[..., None]
+    return Near(point, jnp.broadcast_to(seen.mask & (seen.low < TALL), point.shape[:2]))
 
 
 def mover_of(before: Footprint, after: Footprint, duration: float) -> Mover:

@@ -42,10 +42,18 @@ def scene_without_people(scene: Scene) -> Scene:
 
 def scene_with_people(scene: Scene, people: People, key: jax.Array) -> Scene:
     """A scene with people in it, seen, scanned and hit; those that it has already stay."""
+    added = people.speed.shape[0]
     if scene.people is not None:
         people = join(scene.people, people)
         scene = scene_without_people(scene)
-    return dataclasses.replace(scene, solids=body.added(scene.solids, people, key), people=people)
+    finish = scene.finish
+    if finish is not None:  # people have no texture
+        labels = (0, added * body.PARTS)
+        finish = dataclasses.replace(
+            finish, texture=jnp.pad(finish.texture, labels), scale=jnp.pad(finish.scale, labels, constant_values=1.0)
+        )
+    solids = body.added(scene.solids, people, key)
+    return dataclasses.replace(scene, solids=solids, people=people, finish=finish)
 
 
 def poses_among_people(speed: float, yaw_rate: float, duration: float, half_length: float, half_width: float) -> int:
