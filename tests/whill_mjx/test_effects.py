@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import lru_cache
 
+import effects_in_hand
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effects_in_hand import yielding
+from effects_in_hand import run, yielding
 
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.acceleration_limit import AccelerationLimit
@@ -21,22 +23,12 @@ from whill_mjx.effects.planar import spin_response
 from whill_mjx.effects.rolling_resistance import RollingResistance
 from whill_mjx.effects.slip_traction import SlipTraction
 from whill_mjx.effects.yaw_scrub import YawScrub
-from whill_mjx.vehicle.dynamics import measure, nominal_world, place
-from whill_mjx.vehicle.model import build_model
-from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.types import Drive, Odometry, parameters_of
 
 DRIVES = {name for name, kind in EFFECTS.items() if kind.card.drives}
 pytestmark = pytest.mark.quick
-
-
-def motion_at(v=0.0, omega=0.0, sideways=0.0):
-    """Motion of the chair rolling at v [m/s], omega [rad/s] with a sideways speed added."""
-    spec, params = preset("whill_cr")
-    model = build_model(spec)
-    state = place(model, params, 0.0, 0.0, 0.0, (v, omega))
-    state = state.replace(qvel=state.qvel.at[1].add(sideways))
-    return measure(model, params, nominal_world(model), state)
+motion_at = lru_cache(effects_in_hand.motion_at)
+"""Measured once for all tests that ask for the same motion."""
 
 
 def neutral(kind):
@@ -161,27 +153,17 @@ def test_a_limit_of_the_wheels_bounds_the_faster_wheel():
 
 @pytest.mark.parametrize("delay", [0.0, 0.02, 0.1, 0.22])
 def test_a_delayed_command_arrives_after_its_delay(delay):
-    effect = CommandDelay(delay=jnp.array(delay))
-    memory = effect.init()
-    motion = motion_at()
-    heard = []
-    for step in range(80):
-        sent = jnp.array([1.0, 0.5]) if step >= 10 else jnp.zeros(2)
-        memory, command = effect.command(memory, sent, motion)
-        heard.append(float(command[0]))
+    effect, motion = CommandDelay(delay=jnp.array(delay)), motion_at()
+    sent = jnp.zeros((80, 2)).at[10:].set(jnp.array([1.0, 0.5]))
+    heard = run(effect, sent)[:, 0].tolist()
     arrival = next(step for step, value in enumerate(heard) if value > 0.5)
     assert arrival == 10 + round(delay / motion.dt)
     assert heard[-1] == 1.0
 
 
 def test_a_delay_keeps_the_order_of_commands_that_are_under_way():
-    effect = CommandDelay(delay=jnp.array(0.3))
-    memory, motion = effect.init(), motion_at()
     sent = np.repeat([0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4, 0.4], 20)
-    heard = []
-    for value in sent:
-        memory, command = effect.command(memory, jnp.array([value, 0.0]), motion)
-        heard.append(float(command[0]))
+    heard = run(CommandDelay(delay=jnp.array(0.3)), jnp.stack([sent, 0 * sent], axis=1))[:, 0]
     np.testing.assert_allclose(heard[61:], sent[1:-60], atol=1e-5)
 
 

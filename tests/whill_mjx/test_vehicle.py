@@ -213,17 +213,24 @@ def test_a_heavy_wheel_takes_longer_to_spin_up_where_nothing_grips(dynamics):
         np.testing.assert_allclose(spin, 0.05 * 1.5 / (ratio * spec.wheel_inertia), rtol=0.01)
 
 
+@lru_cache
+def in_the_air(dynamics):
+    """A chair with wheels of twice their inertia 5 m above the floor, its drive, and one compiled control period."""
+    spec, params = preset("whill_cr_physical")
+    params = with_effects(params, ("suspension", "wheel_inertia"))
+    params = set_values(params, ["wheel_inertia.ratio"], jnp.array([2.0]))
+    model = build_model(spec, VehicleConfig(dynamics=dynamics))
+    state = place(model, params, 0.0, 0.0, 0.0)
+    state = dataclasses.replace(state, qpos=state.qpos.at[2].add(5.0))
+    return spec, params, jax.jit(lambda vehicle: drive(model, vehicle, state, jnp.array([1.0, 0.0])))
+
+
 @pytest.mark.parametrize("dynamics", ["fused", "mjx"])
 @pytest.mark.parametrize("reaction", [0.0, 0.4, 1.0])
 def test_a_chair_in_the_air_turns_against_what_its_wheels_are_spun_up_by(reaction, dynamics):
     """Its angular momentum stays 0: what the wheels themselves carry of it the chassis has with the opposite sign."""
-    spec, params = preset("whill_cr_physical")
-    params = with_effects(params, ("suspension", "wheel_inertia"))
-    params = set_values(params, ["wheel_inertia.ratio", "wheel_inertia.reaction"], jnp.array([2.0, reaction]))
-    model = build_model(spec, VehicleConfig(dynamics=dynamics))
-    state = place(model, params, 0.0, 0.0, 0.0)
-    state = dataclasses.replace(state, qpos=state.qpos.at[2].add(5.0))
-    state = jax.jit(lambda state: drive(model, params, state, jnp.array([1.0, 0.0])))(state)
+    spec, params, period = in_the_air(dynamics)
+    state = period(set_values(params, ["wheel_inertia.reaction"], jnp.array([reaction])))
     wheels = reaction * 2.0 * spec.wheel_inertia * float(state.qvel[6:8].sum())
     assert float(state.qvel[6]) > 5.0
     np.testing.assert_allclose(float(state.qvel[4]) * box_inertia(spec)[1], -wheels, atol=1e-4)
@@ -347,14 +354,19 @@ def test_a_state_that_is_not_finite_is_flagged_and_contained():
     assert not period(params, state, jnp.array([0.1, 0.0])).diverged
 
 
+@lru_cache
+def slow_period():
+    """A chair whose limits are lower than the makers', at rest, and one compiled control period of it."""
+    spec, params = preset("whill_cr_physical")
+    model = build_model(dataclasses.replace(spec, v_min=-0.2, v_max=0.4, omega_max=0.6))
+    return place(model, params, 0.0, 0.0, 0.0), jax.jit(lambda state, command: drive(model, params, state, command))
+
+
 @pytest.mark.parametrize("command", [(3.0, 0.0), (-3.0, 0.0), (0.0, 4.0), (0.0, -4.0)])
 def test_a_vehicle_cuts_commands_to_its_limits(command):
-    spec, params = preset("whill_cr_physical")
-    slow = dataclasses.replace(spec, v_min=-0.2, v_max=0.4, omega_max=0.6)
-    model = build_model(slow)
-    period = jax.jit(lambda state, command: drive(model, params, state, command))
+    rest, period = slow_period()
     cut = np.clip(command, (-0.2, -0.6), (0.4, 0.6))
-    asked = limited = place(model, params, 0.0, 0.0, 0.0)
+    asked = limited = rest
     for _ in range(3):
         asked, limited = period(asked, jnp.asarray(command)), period(limited, jnp.asarray(cut))
     np.testing.assert_array_equal(asked.qpos, limited.qpos)
