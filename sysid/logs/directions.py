@@ -101,7 +101,7 @@ def direction(motion: Motion, reach: float, mirrored: bool = False) -> Direction
 
 def inverted(motion: Motion) -> Motion:
     """The same motion if the pose is that of the fixed frame in the vehicle's."""
-    back = -np.column_stack(turned_by(*motion.place.T, -motion.yaw))
+    back = -np.column_stack(turned_by(motion.place[:, 0], motion.place[:, 1], -motion.yaw))
     return replace(motion, steps=np.gradient(back, GRID_DT, axis=0), place=back, yaw=-motion.yaw, turn=-motion.turn)
 
 
@@ -135,7 +135,8 @@ def in_fixed_frame(motions: Sequence[Motion]) -> bool:
     fixed, own = [], []
     for one in motions:
         fixed.append(_explained(one.v, one.steps))
-        own.append(_explained(one.v, np.column_stack([*turned_by(*one.steps.T, -one.yaw), one.turn])))
+        ahead, left = turned_by(one.steps[:, 0], one.steps[:, 1], -one.yaw)
+        own.append(_explained(one.v, np.column_stack([ahead, left, one.turn])))
     left, other = 1 - float(np.median(fixed)), 1 - float(np.median(own))
     return left < min(1 - WHOLE, UNLIKE * other) and other > PLAINER
 

@@ -180,7 +180,7 @@ def placement(path: np.ndarray, limits: Limits) -> tuple[float, float, float] | 
     length, width = (side - 2 * limits.margin for side in limits.room)
     best: tuple[float, tuple[float, float, float]] | None = None
     for yaw in np.deg2rad(np.arange(0.0, 180.0, 5.0)):
-        x, y = turned_by(*path.T, yaw)
+        x, y = turned_by(path[:, 0], path[:, 1], yaw)
         spare = min(length - float(np.ptp(x)), width - float(np.ptp(y)))
         if spare >= 0 and (best is None or spare > best[0] + 1e-9):
             place = (limits.room[0] / 2 - float(x.max() + x.min()) / 2, limits.room[1] / 2 - float(

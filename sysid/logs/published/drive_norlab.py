@@ -265,7 +265,7 @@ def _chain(
     """Both windows in the frame of the first, the second of which starts that far on [m, rad]."""
     x0, y0, yaw0 = (float(values[-1]) for values in first)
     x0, y0, yaw0 = x0 + way * np.cos(yaw0 + turn / 2), y0 + way * np.sin(yaw0 + turn / 2), yaw0 + turn
-    x, y = turned_by(*second[:2], yaw0)
+    x, y = turned_by(second[0], second[1], yaw0)
     return tuple(np.append(one, other) for one, other in zip(first, (x0 + x, y0 + y, yaw0 + second[2]), strict=True))
 
 
