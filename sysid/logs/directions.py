@@ -135,8 +135,8 @@ def in_fixed_frame(motions: Sequence[Motion]) -> bool:
     fixed, own = [], []
     for one in motions:
         fixed.append(_explained(one.v, one.steps))
-        ahead, left = turned_by(one.steps[:, 0], one.steps[:, 1], -one.yaw)
-        own.append(_explained(one.v, np.column_stack([ahead, left, one.turn])))
+        ahead, across = turned_by(one.steps[:, 0], one.steps[:, 1], -one.yaw)
+        own.append(_explained(one.v, np.column_stack([ahead, across, one.turn])))
     left, other = 1 - float(np.median(fixed)), 1 - float(np.median(own))
     return left < min(1 - WHOLE, UNLIKE * other) and other > PLAINER
 
