@@ -198,8 +198,8 @@ def _map_of(options: Options, starts: np.ndarray) -> np.ndarray:
     group = side_by_side([make_map_scene(read_map(name)) for name in maps_of(options, options.unseen).split(",")])
     pairs = zip(group.parts, group.shifts, strict=True)
     corners = [part.walls.segments.reshape(-1, 2) + shift for part, shift in pairs]
-    inside = [(starts >= one.min(0)).all(-1) & (starts <= one.max(0)).all(-1) for one in corners]
-    return np.argmax(inside, 0)
+    away = [np.maximum(one.min(0) - starts, starts - one.max(0)).max(-1) for one in corners]  # 0 or less inside
+    return np.argmin(away, 0)
 
 
 @contextmanager

@@ -316,6 +316,7 @@ class _Run:
         if finished or self._stopped or due:
             # A run that goes on from here has no older lines.
             self._stopped = self._write_waiting(at_once=True) or self._stopped
+            jax.block_until_ready(self.state)
             with self._pace:
                 self._save()
 

@@ -53,8 +53,8 @@ HEADLINES = (  # file, what, value
     ),
     (
         "undeclared",
-        "False alarms on drives with nothing missing (upper 95 % bound; none in 81 fresh logs)",
-        "{false_alarm_upper_fresh|%}",
+        "False alarms on fresh drives with nothing missing, and the upper 95 % bound",
+        "{false_alarms_fresh} of {false_alarms_fresh|.n}, {false_alarm_upper_fresh|%}",
     ),
 )
 

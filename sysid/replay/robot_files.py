@@ -84,7 +84,7 @@ def read_robot(path: Path, wheels: Sequence[str] = (), wheel_radius: float | Non
         return RobotFile(spec, [*left_out, *_place_meshes(path, spec)], included=tuple(included))
     drive = stated_drive(top)
     notes = [*left_out, *complete_links(path, top),
-             *_place_urdf_meshes(path, top, wheels, wheel_radius or drive.radius)]
+             *_place_urdf_meshes(path, top, wheels, wheel_radius, drive)]
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(top, encoding="unicode"))
     return RobotFile(spec, notes, _frictions(top), drive, tuple(included))
 
@@ -205,10 +205,12 @@ def _is_readable(path: Path) -> bool:
 
 
 def _place_urdf_meshes(
-    path: Path, top: ElementTree.Element, wheels: Sequence[str], wheel_radius: float | None,
+    path: Path, top: ElementTree.Element, wheels: Sequence[str], wheel_radius: float | None, drive: StatedDrive,
 ) -> list[str]:  # fmt: skip
-    """Give meshes their whole paths; those that are not found become boxes, and cylinders on wheels."""
+    """Give meshes their whole paths; those that are not found become boxes, and cylinders on wheels. The radius that a
+    plugin states is that of the wheels which it drives."""
     notes: list[str] = []
+    driven = {*drive.left, *drive.right, *drive.by_speed, *wheels}
     axles = {child.get("link"): joint for joint in top.iter("joint") if joint.get("type") == "continuous"
              and (child := joint.find("child")) is not None
              and (joint.get("name") in wheels or re.search("wheel", f"{joint.get('name')} {child.get('link')}", re.I))}
@@ -227,7 +229,9 @@ def _place_urdf_meshes(
                     link.remove(element)  # it does nothing
                 else:
                     geometry.remove(mesh)
-                    shape = _stand_in(link, element, geometry, axles.get(link.get("name")), wheel_radius)
+                    axle = axles.get(link.get("name"))
+                    stated = drive.radius if axle is not None and axle.get("name") in driven else None
+                    shape = _stand_in(link, element, geometry, axle, wheel_radius or stated)
                     notes.append(f"{path.name}: mesh {name} of link {link.get('name')} is not found, or MuJoCo cannot "
                                  f"read it; {shape} stands in for it")
     compiler_of(top).set("strippath", "false")

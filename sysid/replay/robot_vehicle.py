@@ -33,6 +33,8 @@ CREEP, SIDE_CREEP = 0.002, 0.005  # m/s, sliding speeds of a stiff tyre along an
 SAG = 0.01  # of the wheel radius, of hard tyres; with a chair's 5 mm a robot of 6 cm wheelbase tips over when it brakes
 DRIVE = {"drive.kp": "torque_drive.kp", "drive.ki": "torque_drive.ki", "drive.limit": "torque_drive.limit"}
 FRICTION = ".friction"
+ROUNDED = 1e-3
+"""Shares of the weight up to this are of axles that a file places with few digits."""
 
 
 def vehicle_of(
@@ -103,8 +105,9 @@ def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     """
     host = robot.host
     axles = _ahead(robot, robot.resting.xanchor[list(robot.joints)])
-    half = round(float(np.ptp(axles)) / 2, 6)
-    share = 1 - float(np.var(axles)) / half**2 if len(axles) > 4 else 0.0
+    half, middle = float(np.ptp(axles)) / 2, float(axles.max() + axles.min()) / 2
+    share = round(1 - float(np.mean((axles - middle) ** 2)) / half**2, 6) if len(axles) > 4 and half > 0 else 0.0
+    half = round(half, 6)
     mass, com, yaw_inertia = _mass_of(robot, {})
     low, high = extent_of(robot)
     length, width, height = (high - low).tolist()
@@ -114,8 +117,8 @@ def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     spec = replace(spec, mass=mass, drive="skid", wheelbase=2 * half, rear_axle_x=-half - float(low[0] + high[0]) / 2,
                    wheel_inertia=wheels * spin, body_length=length, body_width=width, body_height=height)
     found = {"body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
-             "body.com_y": com[1], "body.com_z": com[2], **({"middle_wheels.share": share} if share else {})}
-    params = with_effects(in_short(spec, "physical"), ("middle_wheels",) if share else ())
+             "body.com_y": com[1], "body.com_z": com[2], **({"middle_wheels.share": share} if share > ROUNDED else {})}
+    params = with_effects(in_short(spec, "physical"), ("middle_wheels",) if share > ROUNDED else ())
     return Twin(spec, set_values(params, list(found), jnp.asarray(list(found.values()), jnp.result_type(float))), {})
 
 

@@ -178,9 +178,15 @@ def _with_followers(spec: Any, standing: Mapping[str, _Stand], joints: tuple[str
     """Driven joints and those of wheels that mimic them, in order; without these where they are not in pairs."""
     half, sides = len(joints) // 2, list[list[str]]()
     for side in (joints[:half], joints[half:]):
-        following = {one.name1 for one in spec.equalities if one.type == mujoco.mjtEq.mjEQ_JOINT and one.name2 in side}
-        names = {*side, *(name for name in following if name in standing and standing[name].is_wheel)}
-        sides.append(sorted(names, key=lambda one: -standing[one].place[0]))
+        names, before = set(side), set[str]()
+        while names != before:  # one may mimic another that mimics the driven one
+            before = set(names)
+            names |= {one.name1 for one in spec.equalities
+                      if one.type == mujoco.mjtEq.mjEQ_JOINT and one.name2 in before
+                      and one.name1 in standing and standing[one.name1].is_wheel}
+        sides.append(sorted(names, key=lambda one: (-standing[one].place[0], one)))
+    if set(sides[0]) & set(sides[1]):
+        return joints
     return (*sides[0], *sides[1]) if len(sides[0]) == len(sides[1]) else joints
 
 

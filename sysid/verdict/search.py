@@ -14,7 +14,17 @@ from sysid.verdict.forms import forms_of
 from sysid.verdict.found import EFFORT, LARGEST, Candidate, PairScan, Search
 from sysid.verdict.pairs import DRAWS, scan_pairs
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
-from sysid.verdict.rounds import POLISH, Asked, candidate_of, candidates_of, class_of, p_of_last, pair_round
+from sysid.verdict.rounds import (
+    POLISH,
+    TO_ITS_END,
+    Asked,
+    candidate_of,
+    candidates_of,
+    class_of,
+    nearer,
+    p_of_last,
+    pair_round,
+)  # fmt: skip
 from sysid.verdict.scan import best, null_days
 
 
@@ -92,24 +102,33 @@ def _in_their_place(asked: Asked, found: Search, findings: Findings, weighed: Se
         return list(weighed)
     starts = [one.members[0] for one in [one for one in able if len(one.members) == 1][1:2]]
     last = best.members[-1]
-    [fit] = asked.refitter.fit_all([Start((last.hypothesis,), asked.base.u, last.refit.split[-1])], POLISH)
-    starts = [one for one in starts if one.hypothesis.effect != last.hypothesis.effect]
-    starts.append(candidate_of(asked, asked.hypotheses.index(last.hypothesis), fit, asked.base))
-    out, tried = list(weighed), {frozenset(one.numbers.effects) for one in weighed}
-    beside = {}
+    starts = [*(one for one in starts if one.hypothesis.effect != last.hypothesis.effect), _alone(asked, found, last)]
+    out, tried, beside = list(weighed), {frozenset(one.numbers.effects) for one in weighed}, {}
     for first in starts:
         beside[first.hypothesis.effect] = candidates = candidates_of(asked, found, first.refit)
-        new = [one for one in candidates if one.p < asked.thresholds.alpha
-               and frozenset((first.hypothesis.effect, one.hypothesis.effect)) not in tried]
-        out += [_weighed(asked, (first, one), (found.rounds[0], candidates)) for one in new[: EFFORT.weighed]]
-    alone = {one.hypothesis.effect: one.gain for one in (*found.rounds[0], *starts)}
+        likely = {one.hypothesis.effect: one for one in reversed(candidates) if one.p < asked.thresholds.alpha}
+        fresh = [one for name, one in likely.items() if frozenset((first.hypothesis.effect, name)) not in tried]
+        new = sorted(fresh, key=lambda one: -one.gain)[: EFFORT.weighed]
+        tried |= {frozenset((first.hypothesis.effect, one.hypothesis.effect)) for one in new}
+        out += [_weighed(asked, (first, one), (found.rounds[0], candidates)) for one in new]
+    alone = {one.hypothesis.effect: one.gain for one in (*reversed(found.rounds[0]), *starts)}
     return [_with_classes(asked, one, out, alone, beside) if len(one.members) == 2 else one for one in out]
+
+
+def _alone(asked: Asked, found: Search, last: Candidate) -> Candidate:
+    """The last effect of a set fitted alone, to its end: from its best fit of the first round, if there is one."""
+    start = Start((last.hypothesis,), asked.base.u, last.refit.split[-1])
+    before = next((one for one in found.rounds[0] if one.hypothesis.effect == last.hypothesis.effect), None)
+    [begun] = nearer(asked.refitter, [start], asked.base) if before is None else [Start.at(before.refit)]
+    [fit] = asked.refitter.fit_all([begun], TO_ITS_END)
+    return candidate_of(asked, asked.hypotheses.index(begun.hypotheses[-1]), fit, asked.base)
 
 
 def _with_classes(asked: Asked, pair: Weighed, sets: Sequence[Weighed], alone: Mapping[str, float],
                   beside: Mapping[str, Sequence[Candidate]]) -> Weighed:
     """A pair whose classes hold what may stand in the place of either effect, by all that was refitted beside the other
-    one: in `sets`, and as candidates of a round. `alone` are the gains of single effects."""
+    one: in `sets`, and as candidates of a round. `alone` are the gains of single effects. What the first effect was not
+    separated from when it was alone does not count."""
     classes = list(pair.numbers.classes)
     for place, name in enumerate(pair.numbers.effects):
         other = pair.numbers.effects[1 - place]
@@ -121,7 +140,7 @@ def _with_classes(asked: Asked, pair: Weighed, sets: Sequence[Weighed], alone: M
         there += beside.get(other, ())
         mine = max((one for one in there if one.hypothesis.effect == name), key=lambda one: one.gain)
         found = class_of(asked, mine, there)
-        classes[place] = (*found, *(one for one in classes[place] if one not in found))
+        classes[place] = (*found, *(one for one in classes[place] if place and one not in found))
     return replace(pair, numbers=replace(pair.numbers, classes=tuple(map(tuple, classes))))
 
 

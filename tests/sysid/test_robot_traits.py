@@ -75,6 +75,14 @@ def followers(folder):
     return urdf(folder, *parts, plugin("libgazebo_ros_diff_drive.so", leftJoint="front_left", rightJoint="front_right"))
 
 
+def followers_of_followers(folder):
+    """A plugin drives the front wheels, the middle ones mimic them, and the rear ones the middle ones."""
+    parts = [wheel(f"{axle}_{side}", x, y, TYRE, more=f'<mimic joint="{before}_{side}"/>' if before else "")
+             for axle, before, x in (("front", "", 0.12), ("middle", "front", 0.0), ("rear", "middle", -0.12))
+             for side, y in SIDES]
+    return urdf(folder, *parts, plugin("libgazebo_ros_diff_drive.so", leftJoint="front_left", rightJoint="front_right"))
+
+
 def rockers(folder):
     """Six wheels on rockers and bogies, which are held."""
     end = '<limit lower="-0.5" upper="0.5" effort="0" velocity="1"/>'
@@ -168,8 +176,8 @@ def ellipsoids(folder):
     return path
 
 
-FILES = {arguments: 2, hubs: 2, followers: 4, rockers: 6, turned_frames: 2, meshes: 2, lost_meshes: 2, included: 2,
-         ellipsoids: 2}
+FILES = {arguments: 2, hubs: 2, followers: 4, followers_of_followers: 6, rockers: 6, turned_frames: 2, meshes: 2,
+         lost_meshes: 2, included: 2, ellipsoids: 2}
 """Each file, and how many driven wheels it has; all have a radius of 60 mm and a track of 0.3 m."""
 
 
@@ -190,6 +198,15 @@ def test_a_size_that_a_plugin_takes_otherwise_is_named(tmp_path):
     robot = load_robot(meshes(tmp_path, separation=0.33))
     [note] = [one for one in robot.notes if "a plugin takes" in one]
     assert "a plugin takes 0.33 m for the distance between the wheels, but its shapes have 0.3 m" in note
+
+
+def test_the_radius_that_a_plugin_states_is_not_that_of_a_caster(tmp_path):
+    caster = link("caster_wheel", '<mesh filename="gone.stl"/>', 0.3, 1.35e-4) + joint(
+        "caster_wheel_joint", "caster_wheel", "-0.12 0 -0.03", "continuous")
+    path = meshes(tmp_path)
+    path.write_text(path.read_text().replace("</robot>", f"{caster}</robot>"))
+    [note] = [one for one in load_robot(path).notes if "caster_wheel" in one and "stands in" in one]
+    assert "a cylinder of 0.03 m radius" in note
 
 
 def test_supports_before_and_behind_the_axle_are_raised_whichever_way_a_robot_faces(tmp_path):

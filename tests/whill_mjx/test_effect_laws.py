@@ -261,11 +261,12 @@ def test_casters_parked_across_swivel_over_a_few_trails():
 
 
 @quick
+@pytest.mark.parametrize("growth", [0.0, 2.0])
 @pytest.mark.parametrize("v", [0.5, -1.0])
-def test_speed_dependent_losses_follow_their_power_law(v):
-    _, rolling = make_effect("rolling_resistance_speed", mu_1=0.01).force((), motion_at(v))
+def test_speed_dependent_losses_follow_their_power_law(v, growth):
+    _, rolling = make_effect("rolling_resistance_speed", mu_1=0.01, growth=growth).force((), motion_at(v))
     _, drag = make_effect("quadratic_drag", coefficient=2.0).force((), motion_at(v))
-    np.testing.assert_allclose(rolling.fx, -0.01 * v * WEIGHT, rtol=0.02)
+    np.testing.assert_allclose(rolling.fx, -0.01 * (1 + growth * abs(v)) * v * WEIGHT, rtol=0.02)
     np.testing.assert_allclose(drag.fx, -2.0 * abs(v) * v, rtol=1e-3)
 
 

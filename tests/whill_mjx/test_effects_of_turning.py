@@ -146,6 +146,9 @@ def test_six_wheels_share_the_load_evenly_and_their_forces_keep_sum_and_moments(
     corners = at_contacts(forces)
     np.testing.assert_allclose(corners[::2].sum(), forces[::2].sum(), rtol=1e-6)
     np.testing.assert_allclose(world.geometry.contact_x @ corners, places @ forces, atol=1e-5)
+    tilted = replace(motion, normal_force=jnp.array([10.0, 100.0, 90.0, 100.0]))
+    carried = loads_of_wheels(tilted)  # the rear left wheel is lifted
+    np.testing.assert_allclose(carried[::2], [0.0, 20.0, 80.0], atol=1e-4)
     _, world = make_effect("middle_wheels", share=1 / 3).world((), nominal_world(chair()[0]))
     carried = loads_of_wheels(replace(motion_at(), world=world))
     np.testing.assert_array_equal(carried[2:4], 0.0)  # no wheels there on a differential drive

@@ -107,6 +107,7 @@ def test_a_scan_meets_boxes_at_its_height_and_turns_with_the_vehicle():
     lidar = Lidar(rays=4, fov=2 * np.pi)
     np.testing.assert_allclose(np.sort(lidar.angles()), np.deg2rad([-135, -45, 45, 135]))
     np.testing.assert_allclose(lidar.mirrored(jnp.arange(4.0)), [3, 2, 1, 0])
+    assert Lidar(yaw=3.1416, y=1e-16).mirrored is not None and Lidar(y=0.01).mirrored is None
 
 
 @pytest.mark.quick

@@ -109,15 +109,17 @@ def test_every_effect_at_its_neutral_and_usual_values_may_be_in_a_file(tmp_path,
 
 def test_a_file_from_before_a_parameter_was_added_has_it_neutral(tmp_path):
     spec, params = preset("whill_cr_physical")
-    path = save_vehicle(tmp_path / "vehicle.toml", spec, with_effects(params, ("suspension", "sensor_delay")))
+    more = ("suspension", "sensor_delay", "rolling_resistance_speed")
+    path = save_vehicle(tmp_path / "vehicle.toml", spec, with_effects(params, more))
     text = path.read_text()
-    for name in ("damping", "speed"):
+    for name in ("damping", "speed", "growth"):
         first = text.index(f"[effects.parameters.{name}]")
         text = text[:first] + text[first:].partition("\n\n")[2]
     assert "parameters.damping" not in text and "parameters.sag" in text and "parameters.delay" in text
     path.write_text(text)
     effects = {effect.name: effect for effect in load_vehicle(path)[1].effects}
     assert float(effects["suspension"].damping) == 0.5 and float(effects["sensor_delay"].speed) == 0.0
+    assert float(effects["rolling_resistance_speed"].growth) == 0.0
     path.write_text(text.replace("[effects.parameters.sag]", "[effects.parameters.damping]"))
     with pytest.raises(ValueError, match="suspension"):
         load_vehicle(path)

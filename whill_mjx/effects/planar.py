@@ -57,12 +57,14 @@ def at_wheels(motion: Motion, values: jax.Array) -> jax.Array:
 
 
 def loads_of_wheels(motion: Motion) -> jax.Array:
-    """Loads (4,) or (6,) [N] of the wheels: those in the middle take their share of both others of their side."""
+    """Loads (4,) or (6,) [N] of the wheels: those in the middle take their share of both others of their side, at most
+    until one of these is lifted."""
     loads, driven = motion.normal_force, motion.world.geometry.driven
     if motion.world.middle is None:
         return loads
-    middle = motion.world.middle * driven.min() * (loads[:2] + loads[2:])  # none on a differential drive
-    return jnp.concatenate([jnp.maximum(loads[:2] - middle / 2, 0.0), middle, jnp.maximum(loads[2:] - middle / 2, 0.0)])
+    most = 2 * jnp.minimum(loads[:2], loads[2:])
+    middle = driven.min() * jnp.minimum(motion.world.middle * (loads[:2] + loads[2:]), most)  # none where two are free
+    return jnp.concatenate([loads[:2] - middle / 2, middle, loads[2:] - middle / 2])
 
 
 def at_contacts(forces: jax.Array) -> jax.Array:

@@ -28,6 +28,8 @@ LANE = np.array([-1.0, -2.2]), np.array([1.6, 2.2])
 """Corners of the picture of a lane: the first from the start, the second from the goal's x and the middle [m]."""
 AROUND = 1.5
 """What other pictures show around path and goal [m]."""
+FARTHEST = 100.0
+"""Points farther from the goal are of a vehicle that diverged [m]."""
 
 
 def ending(episodes: Episodes, index: int) -> str:
@@ -68,7 +70,8 @@ def draw_scene(axes: Any, scene: Any, goal_radius: float, path: np.ndarray) -> N
 def _frame(path: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Corners (2,) of a picture: those of a lane where it holds path and goal, else `AROUND` them."""
     low, high = LANE[0], LANE[1] + [goal[0], 0.0]
-    points = np.vstack([path[np.isfinite(path).all(-1)], goal])  # of one that diverged, what is there
+    points = np.vstack([path[np.isfinite(path).all(-1)], goal])
+    points = points[np.abs(points - goal).max(-1) < FARTHEST]  # of one that diverged, what is there
     if (points >= low).all() and (points <= high).all():
         return low, high
     return points.min(0) - AROUND, points.max(0) + AROUND

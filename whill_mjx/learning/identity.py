@@ -24,6 +24,8 @@ OUTPUTS = ("config.json", "best", "best.json", "policy_best", "policy_last", "dr
 """Names that a training writes besides the results that all commands share."""
 LATER = ("y", "roll", "yaw")
 """Fields of the camera that older vehicles do not have; at zero they change nothing."""
+NEUTRAL = ("rolling_resistance_speed.growth",)
+"""Parameters of effects likewise."""
 SETTINGS = ("task", "safety", "instances", "eval_every", "eval_episodes", "exploring_starts", "second_tries",
             "looks", "spread", "vary")
 """Fields of a preset that change the result of both learners; evaluations choose the best parameters."""
@@ -55,6 +57,10 @@ def vehicle_label(spec: VehicleSpec, params: VehicleParams) -> str:
     """Name of a vehicle with a checksum of its spec, effects and parameters, whatever else its file says."""
     leaves = jax.tree_util.tree_flatten_with_path(params)[0]
     values = {jax.tree_util.keystr(path): float(np.float32(leaf)) for path, leaf in leaves}
+    for index, effect in enumerate(params.effects):
+        for name in (one.partition(".")[2] for one in NEUTRAL if one.startswith(f"{effect.name}.")):
+            if not values[f".effects[{index}].{name}"]:
+                del values[f".effects[{index}].{name}"]
     about = dataclasses.asdict(spec)
     about["camera"] = {name: value for name, value in about["camera"].items() if value or name not in LATER}
     content = [about, [effect.name for effect in params.effects], values]

@@ -127,6 +127,7 @@ class _Run:
                 self.logged = self.env_steps // self.options.eval_every
                 stopped = self.options.stop is not None and self.options.stop(line)
             if self.done == self.last or stopped or self.pace.due():
+                jax.block_until_ready(self.state)
                 with self.pace:
                     self._save()
 

@@ -30,6 +30,8 @@ FIELDS = (
 )
 IMAGE = tuple(Field(name, "pixels", 1, 4096, kind="whole", needed=False) for name in ("height", "width"))
 """Sizes of an image; None takes those of the environment."""
+ALONG = 1e-3
+"""A sensor that is off the vehicle's middle by less than so much [m, rad] is on it."""
 SCAN = (
     Field("rays", kind="whole", low=1, high=10**5),
     Field("fov", "rad", 1e-3, 6.2832),

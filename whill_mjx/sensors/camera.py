@@ -13,7 +13,7 @@ import numpy as np
 
 from whill_mjx.env import observe
 from whill_mjx.io.fields import CAMERA, Field, check_fields
-from whill_mjx.sensors.base import IMAGE, Reading, Sensor, View
+from whill_mjx.sensors.base import ALONG, IMAGE, Reading, Sensor, View
 from whill_mjx.vehicle.specs import CameraMount
 
 
@@ -59,4 +59,4 @@ class Camera(Sensor):
 
 def is_aside(mount: CameraMount) -> bool:
     """Whether a camera does not look along the vehicle's middle, so that its mirrored image is that of another one."""
-    return bool(mount.y or mount.roll or math.remainder(mount.yaw, math.pi))
+    return max(abs(mount.y), abs(mount.roll), abs(math.remainder(mount.yaw, math.pi))) > ALONG

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.io.fields import Field
-from whill_mjx.sensors.base import SCAN, Reading, Sensor, View
+from whill_mjx.sensors.base import ALONG, SCAN, Reading, Sensor, View
 from whill_mjx.world.lidar import disturbed, first_hits, sent_from
 from whill_mjx.world.scene import Boxes
 
@@ -72,7 +72,7 @@ class Lidar(Sensor):
     @property
     def mirrored(self) -> Callable[[jax.Array], jax.Array] | None:  # type: ignore[override]
         """Left and right exchanged; None of a scanner beside the vehicle's middle, or that scans from right to left."""
-        aside = self.y or self.period or math.remainder(self.yaw, math.pi)
+        aside = self.period or max(abs(self.y), abs(math.remainder(self.yaw, math.pi))) > ALONG
         return None if aside else lambda value: value[..., ::-1]
 
 

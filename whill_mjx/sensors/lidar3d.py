@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.io.fields import Field
-from whill_mjx.sensors.base import SCAN, Reading, Sensor, View
+from whill_mjx.sensors.base import ALONG, SCAN, Reading, Sensor, View
 from whill_mjx.vehicle.kinematics import rotation_from_quaternion
 from whill_mjx.world.lidar import disturbed, sent_from
 from whill_mjx.world.lidar3d import first_returns
@@ -87,4 +87,4 @@ class Lidar3D(Sensor):
     @property
     def mirrored(self) -> Callable[[jax.Array], jax.Array] | None:  # type: ignore[override]
         """Left and right exchanged; None of a scanner beside the vehicle's middle, or that scans from right to left."""
-        return None if self.y or self.period else lambda value: value[..., ::-1, :]
+        return None if self.period or abs(self.y) > ALONG else lambda value: value[..., ::-1, :]

@@ -36,7 +36,7 @@ KIND = "micromobility-vehicle"
 ROBOT_FILES = (".xml", ".mjcf", ".urdf", ".xacro")
 """Ends of the names of robot files, which people give in place of vehicle files."""
 LATER = {"suspension.damping", "sensor_delay.speed", "torque_drive.kff", "torque_drive.period",
-         "wheel_inertia.reaction"}
+         "wheel_inertia.reaction", "rolling_resistance_speed.growth"}
 """Parameters that earlier files do not have: where they are absent they are neutral."""
 NEWER = "Remove the entry or use a newer version of this program."
 

@@ -39,7 +39,7 @@ def draw_ways(
 ) -> Ways:
     """Ways of up to POINTS points between random places of a space, and those near the starts (Q, 2) [m].
 
-    The places are those of the largest part of the space in which people get from everywhere to everywhere.
+    The places are those from which people get to a start.
 
     Args:
         grid, space: of the map.
@@ -48,13 +48,15 @@ def draw_ways(
         seed: of the draw.
     """
     from scipy.sparse.csgraph import connected_components, dijkstra
+    from scipy.spatial import cKDTree
 
     graph = way_graph(grid, space, PASSING)
     _, part = connected_components(graph.links, directed=False)
     rng = np.random.default_rng(seed)
     longest = SPACING * (POINTS - 1)
     rows, length = [], []
-    for origin in rng.choice(np.flatnonzero(part == np.bincount(part).argmax()), WAYS):
+    beside = cKDTree(graph.points).query(starts[:, :2])[1]
+    for origin in rng.choice(np.flatnonzero(np.isin(part, part[beside])), WAYS):
         far, before = dijkstra(graph.links, directed=False, indices=origin, return_predecessors=True, limit=longest)
         reached = np.flatnonzero(np.isfinite(far))
         place = rng.choice(reached[far[reached] >= 0.5 * far[reached].max()])
