@@ -324,9 +324,9 @@ CLAIMS = (
         "furniture (`benchmarks/foreign`). Medians and ranges over three seeds of the whole budget, 200 drives a seed "
         "and variant. The policy of the preset `paper` drove 18 to 23 times. With the stop, a drive ends where the "
         "policy is surprised beyond its own limit. In rooms never seen three later trainings drove 71 to 75 times "
-        "each, without the stop and with weights rounded to half precision. In the trainings before, the GPU drew neighbouring cells of a "
-        "material in one tone, which is mended. The rank correlation is that of success here and there, over 12 "
-        "policies of the trainings before.",
+        "each, without the stop and with weights rounded to half precision. In the trainings before, the GPU drew "
+        "neighbouring cells of a material in one tone, which is mended. The rank correlation is that of success here "
+        "and there, over 12 policies of the trainings before.",
         ("what", "plain", "furnished", "never seen"),
         (
             ("arrived", "{foreign_plain|%}", "{foreign_furnished|%}", "{foreign_unseen|%}"),
