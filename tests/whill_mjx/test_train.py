@@ -31,6 +31,7 @@ from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limit_action
 from whill_mjx.learning.trainings import Trained, best_params
 from whill_mjx.tasks.tasks import Corridor, ObstacleCourse, make_task
 from whill_mjx.train import begin, main
+from whill_mjx.vehicle.specs import WHILL_CR
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +160,7 @@ def test_shaping_changes_the_learners_reward_and_not_the_evaluations():
         return SimpleNamespace(env=SimpleNamespace(command=action, scene=scene)), Step(**vars(told))
 
     batch = SimpleNamespace(count=2, step=step, env=SimpleNamespace(
-        task=task, height=8, width=8, model=SimpleNamespace(config=SimpleNamespace(control_dt=0.1)),
+        task=task, height=8, width=8, model=SimpleNamespace(config=SimpleNamespace(control_dt=0.1), spec=WHILL_CR),
         repaints=False, sensors=()))
     state, action = SimpleNamespace(env=SimpleNamespace(command=commands, scene=scene)), jnp.ones((2, 2))
     new, shaped = functional_env(batch, SAFETY["safe"]).step(state, action)
