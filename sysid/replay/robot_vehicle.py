@@ -106,7 +106,7 @@ def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     host = robot.host
     axles = _ahead(robot, robot.resting.xanchor[list(robot.joints)])
     half, middle = float(np.ptp(axles)) / 2, float(axles.max() + axles.min()) / 2
-    share = round(1 - float(np.mean((axles - middle) ** 2)) / half**2, 6) if len(axles) > 4 and half > 0 else 0.0
+    share = 1 - float(np.mean((axles - middle) ** 2)) / half**2 if len(axles) > 4 and half > 0 else 0.0
     half = round(half, 6)
     mass, com, yaw_inertia = _mass_of(robot, {})
     low, high = extent_of(robot)
