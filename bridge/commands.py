@@ -58,9 +58,7 @@ class Ear:
     def guard_reports(self, zeros: int) -> None:
         """Take the number of zeros that the guard has sent so far; a smaller number comes from a restarted guard."""
         self._reports += 1
-        before = self._guard_zeros
-        if before is None:  # what was heard before the first report may have been the guard's
-            before = zeros - min(zeros, len(self._unknown))
+        before = zeros if self._guard_zeros is None else self._guard_zeros
         self._unheard.extend([self._reports] * (zeros - before if zeros >= before else zeros))
         self._guard_zeros = zeros
 

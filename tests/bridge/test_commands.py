@@ -55,14 +55,6 @@ def test_zero_of_the_guard_may_overtake_our_own_commands():
     assert not reports(ear, 1, 1, 1, 1, 1)
 
 
-def test_a_zero_heard_before_the_first_report_of_the_guard_may_be_the_guards():
-    ear = Ear()
-    ear.heard(0.0, 0.0)
-    assert not reports(ear, 1, 1, 1, 1, 1)
-    ear.heard(0.0, 0.0)
-    assert reports(ear, 1, 1, 1, 1, 1)
-
-
 def test_zero_heard_before_the_guard_reports_it_is_the_guards_however_long_that_takes():
     ear = Ear()
     reports(ear, 0)
