@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -72,11 +73,11 @@ def walked(people, scene=EMPTY):
     return jax.lax.scan(one_step, people, None, length=STEPS)[1]
 
 
-@jax.jit
-def drive(scene, path):
+@partial(jax.jit, static_argnums=2)
+def drive(scene, path, dt=DT):
     def one_step(scene, ends):
         before, after = (chair(*pose) for pose in ends)
-        scene, collided, share = walk_around(scene, before, after, DT, POSES)
+        scene, collided, share = walk_around(scene, before, after, dt, POSES)
         return scene, (scene, collided, share)
 
     return jax.lax.scan(one_step, scene, (path[:-1], path[1:]))[1]
@@ -189,6 +190,17 @@ def test_who_walks_into_a_standing_vehicle_is_counted_once_and_is_no_collision()
     assert int(scenes.people.bumped.sum()) == 1
     assert gaps(scenes, path[1:]).min() > -1e-3
     assert float(scenes.people.position[-1, 0, 0]) < -3.0  # and then walks around it
+
+
+def test_who_walked_into_the_side_of_a_standing_vehicle_goes_on():
+    people, far = walker([1.6, -2.5], [-2.5, 2.75], speed=1.62, yielding=False), []
+    scene = scene_with_people(EMPTY, people, jax.random.key(0))
+    for phase in np.linspace(0.0, 2 * np.pi, 12, endpoint=False):  # the foot behind may touch it as well
+        stood = dataclasses.replace(scene, people=dataclasses.replace(people, phase=jnp.full(1, phase)))
+        scenes, collided, _ = drive(stood, jnp.zeros((STEPS + 1, 3)), DT / 2)
+        assert scenes.people.held[-1].all() and not collided.any()
+        far.append(float(jnp.linalg.norm(scenes.people.position[-1, 0] - jnp.array([-2.5, 2.75]))))
+    assert max(far) < 0.6
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.3, 0.38])

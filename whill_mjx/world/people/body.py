@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.world.people.crowd import TRUNK as WIDTH
 from whill_mjx.world.people.crowd import People
 from whill_mjx.world.people.law import step_length
 from whill_mjx.world.solids import Rounds, Solids
@@ -15,7 +16,7 @@ PARTS = 4
 """Capsules of a person: left leg, right leg, trunk, head."""
 TOUCHING = 3
 """How many of them the vehicle can meet; from above, the head lies within the trunk."""
-RADII = (0.045, 0.045, 0.115, 0.062)
+RADII = (0.045, 0.045, WIDTH, 0.062)
 """Of the capsules, as shares of the height."""
 HIP, FOOT, APART, LIFT = 0.50, 0.05, 0.05, 0.05
 """Heights of a leg's ends, its distance from the middle, and how far a foot is lifted; shares of the height."""

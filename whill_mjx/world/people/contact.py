@@ -1,7 +1,7 @@
 """Contact of the vehicle with people while both move, and whose it is.
 
-A person who walks into a vehicle that stands is stopped by it and counted (`People.bumped`); the episode goes on. A
-contact is a collision of the vehicle where its own border moves towards the person.
+A person who walks into a vehicle that stands is stopped by it, counted (`People.bumped`), and steps back from it, legs
+together, for the rest of the period; the episode goes on. A contact is a collision of the vehicle where its own border moves towards the person.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from whill_mjx.world.collision import HALVINGS, Stadiums, distances
 from whill_mjx.world.people import body
 from whill_mjx.world.people.around import mover_of, near_in
 from whill_mjx.world.people.crowd import People, join
-from whill_mjx.world.people.law import walk
+from whill_mjx.world.people.law import stepped_back, walk
 from whill_mjx.world.scene import Footprint, Scene
 
 Ends = tuple[jax.Array, jax.Array]
@@ -96,8 +96,8 @@ def walk_around(
     """
     people, solids = scene.people, scene.solids
     assert people is not None and solids is not None
-    mover = mover_of(before, after, duration)
-    walked = walk(people, near_in(scene_without_people(scene)), mover, duration)
+    mover, near = mover_of(before, after, duration), near_in(scene_without_people(scene))
+    walked = walk(people, near, mover, duration)
     first = body.ends_of(body.own_rounds(solids, people))
     # The barriers keep XLA from computing the walk and the contacts again for each thing that needs them.
     walked = jax.lax.optimization_barrier(walked)
@@ -131,8 +131,13 @@ def walk_around(
     share = jnp.min(jnp.where(ran_into, high, 1.0), initial=1.0)
     kept = jnp.where(touched, jnp.minimum(low, share), share)  # (N,) how far each person gets
     kept, touched, ran_into = jax.lax.optimization_barrier((kept, touched, ran_into))
-    people_after = _between(people, walked, kept, touched & ~ran_into)
+    stopped = touched & ~ran_into
+    people_after = _between(people, walked, kept, stopped)
     start, end = (a + kept[:, None, None] * (b - a) for a, b in zip(first, last, strict=True))
+    later = mover_of(vehicle(share), after, duration)
+    back = stepped_back(people_after, near, later, jnp.where(stopped, (share - kept) * duration, 0.0))
+    people_after = dataclasses.replace(people_after, position=people_after.position + back)
+    start, end = (ends.at[..., :2].add(back[:, None]) for ends in (start, end))
     solids_after = body.moved(solids, people_after, start, end)
     return dataclasses.replace(scene, solids=solids_after, people=people_after), collided, share
 

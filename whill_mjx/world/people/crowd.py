@@ -12,6 +12,8 @@ from whill_mjx.io.fields import Field, check_fields
 
 RADIUS = 0.16
 """Radius of a person on the ground plane, as others keep clear of it [m]. Source: Xu, Chraibi and Seyfried (2021)."""
+TRUNK = 0.115
+"""Radius of a person's trunk, as a share of the height: nothing of a person who stands is wider."""
 SPEED, SPEED_SPREAD = 1.34, 0.26
 """Mean and standard deviation of the speed at which people walk freely [m/s]. Source: Weidmann (1993)."""
 GAP = 0.5

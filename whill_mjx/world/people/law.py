@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from whill_mjx.world.people.crowd import RADIUS, People
+from whill_mjx.world.people.crowd import RADIUS, TRUNK, People
 
 STRENGTH, REACH = 3.0, 0.1
 """Strength [-] and range [m] of the repulsion between people (k and D of Eq. 3)."""
@@ -91,13 +91,13 @@ def _one_step(people: People, near, mover: Mover | None, dt: float) -> People:
 
     if mover is not None:  # to those who yield, it is a wall beside which they walk
         side = Near(_nearest_on(mover, people.position)[:, None], people.yields[:, None])
-        way = _along_walls(people.position, way, side)
+        way = _along_walls(people.position, way, side, _berth(people))
     room = _room_among_people(people, way)
     if mover is not None:
         room = jnp.minimum(room, _room_to_mover(people, way, mover))
     speed = jnp.clip(room / people.gap, 0.0, people.speed)
     standing = near(people.position)
-    way = _along_walls(people.position, way, standing)
+    way = _along_walls(people.position, way, standing, RADIUS)
 
     scripted = people.scripted[:, None]
     way = jnp.where(scripted, desired, way)
@@ -106,6 +106,8 @@ def _one_step(people: People, near, mover: Mover | None, dt: float) -> People:
     ends = ~people.returns & (people.target == last)
     speed = jnp.where(ends, jnp.minimum(speed, far / dt), speed) * people.there
     place = people.position + dt * speed[:, None] * way
+    if mover is not None:
+        place = _off_mover(people, place, mover, dt)
     place = jnp.where(scripted, place, _out_of_walls(place, near))
     return moved_to(people, place, dt, way)
 
@@ -210,12 +212,11 @@ def _room_among_people(people: People, way: jax.Array) -> jax.Array:
 
 
 def _room_to_mover(people: People, way: jax.Array, mover: Mover) -> jax.Array:
-    """(N,) m: free length ahead up to the vehicle with a person's radius around it, for those who yield."""
+    """(N,) m: free length ahead up to the vehicle with a person's berth around it, for those who yield."""
     along, across = _own_frame(mover, people.position)
     ahead, aside = _own_frame(mover, mover.centre + way)
-    half = mover.half + RADIUS + ASIDE
-    enter, leave = jnp.zeros(ahead.shape), jnp.full(ahead.shape, jnp.inf)
-    for place, go, reach in ((along, ahead, half[0]), (across, aside, half[1])):
+    enter, leave, berth = jnp.zeros(ahead.shape), jnp.full(ahead.shape, jnp.inf), _berth(people)
+    for place, go, reach in ((along, ahead, mover.half[0] + berth), (across, aside, mover.half[1] + berth)):
         go = jnp.where(jnp.abs(go) < 1e-6, 1e-6, go)
         one, other = (-reach - place) / go, (reach - place) / go
         enter, leave = jnp.maximum(enter, jnp.minimum(one, other)), jnp.minimum(leave, jnp.maximum(one, other))
@@ -224,12 +225,37 @@ def _room_to_mover(people: People, way: jax.Array, mover: Mover) -> jax.Array:
     return jnp.where(meets, enter, jnp.inf)
 
 
-def _along_walls(place: jax.Array, way: jax.Array, near: Near) -> jax.Array:
-    """(N, 2) direction without what leads into a wall that is near, wall after wall, the most opposed first."""
+def _off_mover(people: People, place: jax.Array, mover: Mover, dt: float) -> jax.Array:
+    """(N, 2) places of those who yield, a step off the vehicle where it is nearer after `dt` than their trunk allows."""
+    c, s = jnp.cos(dt * mover.yaw_rate), jnp.sin(dt * mover.yaw_rate)
+    axis = jnp.stack([c * mover.axis[0] - s * mover.axis[1], s * mover.axis[0] + c * mover.axis[1]])
+    later = mover._replace(centre=mover.centre + dt * mover.velocity, axis=axis)
+    away = place - _nearest_on(later, place)
+    lacking = jnp.maximum(_berth(people) - _length(away), 0.0)
+    off = jnp.minimum(lacking, dt * people.speed) * (people.yields & people.there)
+    return place + off[:, None] * _unit(away, jnp.zeros(away.shape))
+
+
+def stepped_back(people: People, near, mover: Mover, time: jax.Array) -> jax.Array:
+    """(N, 2) m by which people step straight off the vehicle in a time (N,) [s]; nothing where a wall is behind them."""
+    away = people.position - _nearest_on(mover, people.position)
+    step = (time * people.speed)[:, None] * _unit(away, jnp.zeros(away.shape))
+    behind = near(people.position + step)
+    narrow = (behind.mask & (_length(people.position[:, None] + step[:, None] - behind.point) < RADIUS)).any(-1)
+    return jnp.where(narrow[:, None], 0.0, step)
+
+
+def _berth(people: People) -> jax.Array:
+    """(N,) m between the middle of a person and the vehicle's border, as those who yield keep it."""
+    return TRUNK * people.height + ASIDE
+
+
+def _along_walls(place: jax.Array, way: jax.Array, near: Near, radius: jax.Array | float) -> jax.Array:
+    """(N, 2) direction without what leads into a wall near a person of a radius [m], the most opposed wall first."""
     away = place[:, None] - near.point
     distance = _length(away)
     normal = away / jnp.maximum(distance, 1e-6)[..., None]
-    close = (distance <= RADIUS + BUFFER) & near.mask
+    close = (distance <= jnp.expand_dims(radius, -1) + BUFFER) & near.mask
     for _ in range(2):
         into = jnp.where(close, _dot(normal, way[:, None]), 0.0)  # (N, M)
         worst = jnp.argmin(into, -1)[:, None]
