@@ -1,7 +1,8 @@
 """Contact of the vehicle with people while both move, and whose it is.
 
 A person who walks into a vehicle that stands is stopped by it, counted (`People.bumped`), and steps back from it, legs
-together, for the rest of the period; the episode goes on. A contact is a collision of the vehicle where its own border moves towards the person.
+together, for the rest of the period; the episode goes on. A contact is a collision of the vehicle where its own border
+moves towards the person.
 """
 
 from __future__ import annotations

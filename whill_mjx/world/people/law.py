@@ -226,7 +226,7 @@ def _room_to_mover(people: People, way: jax.Array, mover: Mover) -> jax.Array:
 
 
 def _off_mover(people: People, place: jax.Array, mover: Mover, dt: float) -> jax.Array:
-    """(N, 2) places of those who yield, a step off the vehicle where it is nearer after `dt` than their trunk allows."""
+    """(N, 2) places of those who yield, a step off the vehicle where it is nearer after `dt` than their berth."""
     c, s = jnp.cos(dt * mover.yaw_rate), jnp.sin(dt * mover.yaw_rate)
     axis = jnp.stack([c * mover.axis[0] - s * mover.axis[1], s * mover.axis[0] + c * mover.axis[1]])
     later = mover._replace(centre=mover.centre + dt * mover.velocity, axis=axis)
@@ -237,7 +237,7 @@ def _off_mover(people: People, place: jax.Array, mover: Mover, dt: float) -> jax
 
 
 def stepped_back(people: People, near, mover: Mover, time: jax.Array) -> jax.Array:
-    """(N, 2) m by which people step straight off the vehicle in a time (N,) [s]; nothing where a wall is behind them."""
+    """(N, 2) m by which people step straight off the vehicle in a time (N,) [s]; 0 where a wall is behind."""
     away = people.position - _nearest_on(mover, people.position)
     step = (time * people.speed)[:, None] * _unit(away, jnp.zeros(away.shape))
     behind = near(people.position + step)
