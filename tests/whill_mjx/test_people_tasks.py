@@ -22,6 +22,7 @@ from whill_mjx.sensors.camera import Camera
 from whill_mjx.sensors.depth import Depth
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
+from whill_mjx.tasks import terms
 from whill_mjx.tasks.corridor import Corridor
 from whill_mjx.tasks.follow import Follow
 from whill_mjx.tasks.terms import to_body
@@ -29,7 +30,7 @@ from whill_mjx.vehicle.kinematics import reference_pose
 from whill_mjx.vehicle.types import TimeStep
 from whill_mjx.world.maps.walls import map_walls
 from whill_mjx.world.people.contact import scene_with_people
-from whill_mjx.world.people.crowd import scripted
+from whill_mjx.world.people.crowd import TRUNK, scripted
 from whill_mjx.world.scene import no_boxes, stack_boxes
 from whill_mjx.world.solids import rod, stack_rounds
 
@@ -248,3 +249,26 @@ def test_rich_looks_show_the_walls_of_a_map_and_take_people():
 
     seen, bare = (np.asarray(image).astype(int) for image in draw(jax.random.key(2)))
     assert (np.abs(seen - bare).sum(-1) > 10).mean() > 0.1
+
+
+@quick
+@pytest.mark.parametrize(
+    ("place", "walks", "speed", "turns", "haste"),
+    [
+        ((2.0, 0.0), (0.0, 0.0), 0.8, 0.0, 0.0),  # far enough to stop
+        ((1.0, 0.0), (0.0, 0.0), 0.8, 0.0, 0.8 - (1.0 - 0.5 - 0.2)),
+        ((2.0, 0.0), (-1.3, 0.0), 0.8, 0.0, 0.8 - (2.0 - 0.5 - 0.2 - 1.3)),  # who comes leaves less
+        ((2.0, 0.0), (-1.3, 0.0), 0.0, 0.0, 0.0),  # who stands is in no haste
+        ((0.0, 0.6), (0.0, 0.0), 0.8, 0.0, 0.0),  # nor who drives past
+        ((0.4, 0.6), (0.0, -1.0), 0.0, 1.0, 0.7),  # the front swings towards who comes from the side
+    ],
+)
+def test_haste_is_what_the_vehicle_nears_a_person_too_fast(place, walks, speed, turns, haste):
+    people = dataclasses.replace(scripted(jnp.array([[place, (0.0, 9.0)]]), 0.0), velocity=jnp.array([walks]))
+    people = dataclasses.replace(people, height=jnp.full(1, 0.2 / TRUNK))
+    body = SimpleNamespace(x=0.0, y=0.0, yaw=0.0, half_length=0.5, half_width=0.3)
+    moment = SimpleNamespace(scene=SimpleNamespace(people=people), body=body, pose=jnp.array([-0.3, 0.0, 0.0]),
+                             twist=jnp.array([speed, turns]), diverged=jnp.array(False))  # fmt: skip
+    assert float(terms.haste(moment, 1.0)) == pytest.approx(haste, abs=1e-5)
+    nobody = dataclasses.replace(people, there=jnp.zeros(1, bool))
+    assert float(terms.haste(SimpleNamespace(**{**vars(moment), "scene": SimpleNamespace(people=nobody)}), 1.0)) == 0.0

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from whill_mjx.world.collision import free_distance
+from whill_mjx.world.people.crowd import TRUNK
 from whill_mjx.world.scene import Footprint, Scene
 
 
@@ -49,6 +50,33 @@ def speed_change(moment: Moment) -> jax.Array:
 def shortfall(moment: Moment, margin: float) -> jax.Array:
     """() m by which the distance to the nearest thing falls short of a margin."""
     return jnp.maximum(margin - free_distance(moment.body, moment.scene), 0.0)
+
+
+def haste(moment: Moment, seconds: float) -> jax.Array:
+    """() m/s by which the vehicle nears a person faster than is safe; 0 without people.
+
+    It is safe to near a person so fast that both would touch in no less than `seconds` if the person walked on as now.
+    Only the vehicle's own part counts: who stands beside a person who comes is in no haste.
+    """
+    people, body = moment.scene.people, moment.body
+    if people is None:
+        return jnp.zeros(())
+    c, s = jnp.cos(body.yaw), jnp.sin(body.yaw)
+    heading, left = jnp.stack([c, s]), jnp.stack([-s, c])
+    off = people.position - jnp.stack([body.x, body.y])
+    along = jnp.clip(off @ heading, -body.half_length, body.half_length)
+    aside = jnp.clip(off @ left, -body.half_width, body.half_width)
+    border = along[:, None] * heading + aside[:, None] * left  # (N, 2) from the middle: what is nearest to each person
+    away = off - border
+    distance = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
+    towards = away / distance[:, None]
+    arm = border + jnp.stack([body.x, body.y]) - moment.pose[:2]
+    moves = moment.twist[0] * heading + moment.twist[1] * jnp.stack([-arm[:, 1], arm[:, 0]], -1)
+    nears = jnp.sum(moves * towards, -1)
+    comes = jnp.maximum(-jnp.sum(people.velocity * towards, -1), 0.0)
+    safe = jnp.maximum((distance - TRUNK * people.height) / seconds - comes, 0.0)
+    most = jnp.max(jnp.where(people.there, nears - safe, 0.0), initial=0.0)
+    return jnp.where(moment.diverged, 0.0, most)
 
 
 def goal_vector(moment: Moment, goal: jax.Array) -> jax.Array:
