@@ -73,10 +73,8 @@ def fitted_task(task: Task, spec: VehicleSpec) -> Task:
 def check_name(task: Task) -> None:
     """Raise ValueError for a name that could be no part of a file's name or of Gymnasium's ids."""
     if not isinstance(task.name, str) or not NAME.fullmatch(task.name):
-        raise ValueError(
-            f"task {type(task).__name__}: its name is {shown(task.name)}; it must be letters, digits "
-            "and _, a letter first. Correct it, or leave it out for the name of the class."
-        )
+        raise ValueError(f"task {type(task).__name__}: its name is {shown(task.name)}; it must be letters, digits "
+                         "and _, a letter first. Correct it, or leave it out for the name of the class.")
 
 
 def _check_tables(task: Task) -> None:
@@ -87,9 +85,8 @@ def _check_tables(task: Task) -> None:
         ("per_period", _is_texts(task.per_period), "a tuple of names of reward terms"),
     ):
         if not holds:
-            raise ValueError(
-                f"task {task.name!r}: {name} is {shown(getattr(task, name))}; it must be {wanted}. Correct it."
-            )
+            raise ValueError(f"task {task.name!r}: {name} is {shown(getattr(task, name))}; it must be {wanted}. "
+                             "Correct it.")
 
 
 def _is_table(value: Any) -> bool:
@@ -122,10 +119,8 @@ def _check_names(kind: type) -> None:
         if isinstance(value, FunctionType) and name not in METHODS and not name.startswith("_"):
             meant = difflib.get_close_matches(name, METHODS, 1, ALIKE)
             if meant and meant[0] not in vars(kind):
-                raise ValueError(
-                    f"task {kind.__name__}: its method {name!r} is never called; {meant[0]!r} would be. "
-                    f"Call it so, or _{name} if it is another."
-                )
+                raise ValueError(f"task {kind.__name__}: its method {name!r} is never called; {meant[0]!r} would be. "
+                                 f"Call it so, or _{name} if it is another.")
 
 
 def _check_scalars(task: Task, method: str, moment: Any, what: str, fits: Any) -> None:
@@ -150,10 +145,8 @@ def _traced(task: Task, method: str, argument: Any) -> Any:
 
 def _failed(task: Task, method: str, error: BaseException) -> ValueError:
     said = str(error).strip().split("\n")[0].rstrip(".")
-    return ValueError(
-        f"task {task.name!r}: {method}{_line(task, error)}: {type(error).__name__}: {said}. Correct the "
-        f"method{_hint(error)}."
-    )
+    return ValueError(f"task {task.name!r}: {method}{_line(task, error)}: {type(error).__name__}: {said}. Correct the "
+                      f"method{_hint(error)}.")
 
 
 def _hint(error: BaseException) -> str:

@@ -51,11 +51,9 @@ class Doorway(Task):
         start = jnp.stack([jnp.zeros(()), start_y, towards + draw(-0.3, 0.3, fixed=0.0)])
         left, right = half - (door_y + width / 2), half + (door_y - width / 2)  # lengths of the wall's two parts
         colour = 0.92 * jnp.array(WALL)
-        boxes = stack_boxes(
-            [
-                *lane(jnp.asarray(half), self.goal_x + 2.0),
-                box(self.wall_x, half - left / 2, thickness, left, 2.0, colour),
-                box(self.wall_x, -half + right / 2, thickness, right, 2.0, colour),
-            ]
-        )
+        boxes = stack_boxes([
+            *lane(jnp.asarray(half), self.goal_x + 2.0),
+            box(self.wall_x, half - left / 2, thickness, left, 2.0, colour),
+            box(self.wall_x, -half + right / 2, thickness, right, 2.0, colour),
+        ])
         return World(Scene(boxes, make_marker(self.goal_x, goal_y, size=0.6, height=0.8), default_looks()), start)

@@ -63,9 +63,9 @@ class KerbRamp(Task):
         cut_y, start_y = draw(-0.9, 0.9, fixed=0.4), draw(-0.5, 0.5, fixed=0.0)
         width, rise, run = (draw(*limits, fixed=sum(limits) / 2) for limits in (self.cut, self.rise, self.run))
         goal_y = jnp.clip(cut_y + draw(-0.5, 0.5, fixed=0.0), -1.2, 1.2)
-        start = jnp.stack(
-            [jnp.zeros(()), start_y, jnp.arctan2(cut_y - start_y, self.kerb_x) + draw(-0.3, 0.3, fixed=0.0)]
-        )
+        start = jnp.stack([
+            jnp.zeros(()), start_y, jnp.arctan2(cut_y - start_y, self.kerb_x) + draw(-0.3, 0.3, fixed=0.0)
+        ])
         ramp = Ramp(rise=rise, length=rise * run, distance=jnp.asarray(self.kerb_x), direction=jnp.zeros(()))
         end_x = self.goal_x + 2.0
         boxes = stack_boxes([*lane(jnp.asarray(HALF), end_x), *_stones(ramp, cut_y, width)])
@@ -115,3 +115,4 @@ def _slabs(ramp: Ramp, cut_y: jax.Array, width: jax.Array) -> Blocks:
         half = jnp.stack([length[index] / 2, width / 2, half_thick * one])
         slabs.append(block(middle - half_thick * rotation[:, 2], half, rotation, jnp.array(SLAB)))
     return stack_blocks(slabs)
+

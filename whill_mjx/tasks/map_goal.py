@@ -73,13 +73,8 @@ class MapGoal(Task):
     def reach(self) -> Reach:
         """What the vehicle needs of the map: a WHILL Model CR where none is given."""
         chair = Reach()
-        return Reach(
-            self.passing or chair.passing,
-            self.standing or chair.standing,
-            self.nearest,
-            self.farthest,
-            self.near or chair.near,
-        )
+        return Reach(self.passing or chair.passing, self.standing or chair.standing, self.nearest, self.farthest,
+                     self.near or chair.near)
 
     def sample_world(self, key: jax.Array) -> World:
         """One of the map's pairs of start and goal; always the same in a fixed layout."""

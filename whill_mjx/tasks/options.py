@@ -36,10 +36,8 @@ def read_fields(task: Task, texts: Iterable[str], option: str = "--set") -> dict
         if not equals or not name or not value:
             raise OptionError(f"{option}: {text!r} is not NAME=VALUE. Write it so.")
         if name not in known:
-            raise OptionError(
-                f"{option} {text}: task {task.name!r} has no field {name!r} (known: "
-                f"{', '.join(sorted(known))}). Correct it."
-            )
+            raise OptionError(f"{option} {text}: task {task.name!r} has no field {name!r} (known: "
+                              f"{', '.join(sorted(known))}). Correct it.")
         if name == "layout":
             raise OptionError(f"{option} {text}: the layout has an option of its own. Give --layout {value}.")
         if name in changes:

@@ -49,14 +49,12 @@ def room(half: float, height: float = 2.0) -> Boxes:
     """Four walls around a square of 2 `half` m, centred at the origin."""
     thickness, colour, dark = 0.2, jnp.array(WALL), 0.85 * jnp.array(WALL)
     aside, length = half + thickness / 2, 2 * half + 2 * thickness
-    return stack_boxes(
-        [
-            box(0.0, aside, length, thickness, height, colour),
-            box(0.0, -aside, length, thickness, height, colour),
-            box(aside, 0.0, thickness, length, height, dark),
-            box(-aside, 0.0, thickness, length, height, dark),
-        ]
-    )
+    return stack_boxes([
+        box(0.0, aside, length, thickness, height, colour),
+        box(0.0, -aside, length, thickness, height, colour),
+        box(aside, 0.0, thickness, length, height, dark),
+        box(-aside, 0.0, thickness, length, height, dark),
+    ])
 
 
 def make_marker(x: Any, y: Any, size: float, height: Any, yaw: Any = None) -> Marker:

@@ -76,10 +76,8 @@ def find_task(name: str) -> Task:
         if name not in TASKS:
             if name.endswith(".py"):
                 raise ValueError(f"task {name!r}: a task in a file is named too. Give {name}:CLASS.")
-            raise ValueError(
-                f"unknown task {name!r} (known: {', '.join(TASKS)}). Correct the name, or give "
-                "package.module:TASK or path/to/file.py:TASK."
-            )
+            raise ValueError(f"unknown task {name!r} (known: {', '.join(TASKS)}). Correct the name, or give "
+                             "package.module:TASK or path/to/file.py:TASK.")
         return TASKS[name]
     module = _import(name, place)
     if not hasattr(module, attribute):
@@ -138,10 +136,8 @@ def _as_task(value: Any, where: str) -> Task:
     """The task that a value, or a class with defaults for all its fields, is."""
     if isinstance(value, type) and issubclass(value, Task):
         if "__dataclass_params__" not in value.__dict__ or not value.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-            raise TypeError(
-                f"{where}: {value.__name__} is no frozen dataclass. Decorate it with "
-                "@dataclasses.dataclass(frozen=True)."
-            )
+            raise TypeError(f"{where}: {value.__name__} is no frozen dataclass. Decorate it with "
+                            "@dataclasses.dataclass(frozen=True).")
         value = value()
     if not isinstance(value, Task):
         raise TypeError(f"{where}: {value!r} is no task. Derive its class from whill_mjx.Task.")
@@ -174,14 +170,12 @@ def _import(name: str, place: str) -> ModuleType:
         raise
     except ModuleNotFoundError as error:
         if place.endswith(".py"):
-            raise ValueError(
-                f"task {name!r}: {place} cannot be imported: {error}. Install it, or correct the file."
-            ) from error
+            raise ValueError(f"task {name!r}: {place} cannot be imported: {error}. Install it, or correct the "
+                             "file.") from error
         raise ValueError(f"task {name!r}: {error}. Give package.module:TASK or path/to/file.py:TASK.") from error
     except (Exception, SystemExit) as error:
-        raise ValueError(
-            f"task {name!r}: {place} cannot be imported: {type(error).__name__}: {error}. Correct the file."
-        ) from error
+        raise ValueError(f"task {name!r}: {place} cannot be imported: {type(error).__name__}: {error}. Correct the "
+                         "file.") from error
 
 
 TASKS: Registry[Task] = Registry(
