@@ -52,8 +52,8 @@ TRAINED = ("fetch_office/3_1_16_localization.yaml", "fetch_office/9_16_15.yaml")
 UNSEEN = ("stata_basement/stata_basement.yaml", "willow_garage/willow-full.yaml")
 VEHICLE = "whill_cr_ramp"
 SIGHTS = ("open", "blank", "freeze", "lost")
-"""What the policy is shown: everything; zeros; its first observation all the time; goal and last command alone, with
-scans that meet nothing and black images."""
+"""What the policy is shown: everything; zeros; its first observation all the time; goal, speeds and last command alone,
+with scans that meet nothing and black images."""
 JUDGED = 3_000_029
 """Seed of the worlds in which policies are judged."""
 EVERY_S = 20.0
@@ -76,7 +76,7 @@ class Options:
     """Maps of the test."""
     made: Annotated[int, Range(0, 60)] = 8
     """Made floor plans that the training has besides; all maps lie in one row, which may be 4 km long."""
-    minutes: Annotated[float, Range(0.0, 1000.0, above=True)] = 3.3
+    minutes: Annotated[float, Range(0.0, 1000.0, above=True)] = 7.0
     """Time of each training, without its compilation; the step size falls to zero over it."""
     instances: Annotated[int, COUNT] = 4096
     """Vehicles side by side in a training."""

@@ -36,8 +36,8 @@ class AmongPeople(MapGoal):
     )  # fmt: skip
     budgets: ClassVar[dict[str, Budget]] = {
         "wallclock": Budget(
-            40_000_000, eval_every=2_000_000, second_tries=0.5, stop_success=0.97, fields={"action_repeat": 2},
-            ppo=dict(readings=3, scan=90, discount=0.995, lr=5e-4),
+            120_000_000, eval_every=6_000_000, second_tries=0.5, stop_success=0.97,
+            ppo=dict(readings=4, scan=90, discount=0.999, lr=5e-4),
         ),
         "cpu": Budget(1_000_000, eval_every=250_000, instances=32, fields={"action_repeat": 2, "senses": "lidar"},
                       ppo=dict(rollout=64, minibatches=8, readings=3, scan=90)),
@@ -46,7 +46,8 @@ class AmongPeople(MapGoal):
     map: str = "made:0,made:1"
     """As of `map_goal`; floor plans of ours unless you give others."""
     people: int = 8
-    collision_reward: float = -200.0
+    collision_reward: float = -600.0
+    """Far more than an arrival earns, so that waiting for a person pays."""
     haste_gain: float = 10.0
     """Reward lost in every control period per m/s of haste towards a person (`tasks.terms.haste`)."""
     haste_time: float = 1.0
