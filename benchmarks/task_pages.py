@@ -28,6 +28,8 @@ TERMS = {
     "smoothness": "-{smoothness_gain:g} for each rad/s by which the commanded yaw rate changed",
     "alignment": "-{alignment_gain:g} per rad off the dock's direction, in every period within 1 m of the dock",
     "distance": "{near_reward:g} in every period at the best distance from the person, {keep:g} m; less elsewhere",
+    "haste": "-{haste_gain:g} for each m/s of speed towards a person that would touch them within {haste_time:g} s, in "
+             "every period",
     "lost": "{collision_reward:g} in the period in which the person is lost",
 }
 """What a term of the reward pays, by its name."""
