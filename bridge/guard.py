@@ -50,8 +50,6 @@ class Watchdog:
         """Seconds after which a driving node that gave no sign of life is stopped."""
         self.stops = 0
         """How often a node was found silent while it drove."""
-        self.zeros = 0
-        """Zeros sent so far."""
         self.abandoned = False
         """Whether a node fell silent while it drove, or all that were heard are gone, and none was heard since."""
         self.heard: dict[str, float] = {}
@@ -100,7 +98,7 @@ class Watchdog:
                 del self.heard[session]
                 self.abandoned = self.abandoned or not self.heard
         if self._left and now >= self._next:
-            self._left, self._next, self.zeros = self._left - 1, now + 0.05, self.zeros + 1
+            self._left, self._next = self._left - 1, now + 0.05
             return True
         return False
 
@@ -132,7 +130,7 @@ class GuardNode:
         """Return whether the one node that this guard follows is gone."""
         return bool(self._follow) and time.monotonic() - self._followed > 2 * FORGET
 
-    def _on_command(self, v: float, omega: float) -> None:
+    def _on_command(self, v: float, omega: float, marked: bool) -> None:
         self.watchdog.command(v != 0 or omega != 0)  # not-finite values compare unequal to 0: they count as motion
 
     def _on_heartbeat(self, message: Any) -> None:
@@ -144,8 +142,7 @@ class GuardNode:
     def _on_watch(self) -> None:
         stops = self.watchdog.stops
         if self.watchdog.tick(self.now()):
-            self._on_beat()  # first, so that nobody takes the zero for a stranger's
-            self.topic.publish(0.0, 0.0)
+            self.topic.publish(0.0, 0.0, marked=True)
         if self._lock is not None and self.watchdog.abandoned:
             self._lock.want(time.monotonic(), False)  # it outlives the node that asked for it
         elif self._lock is not None:
@@ -156,7 +153,7 @@ class GuardNode:
 
     def _on_beat(self) -> None:
         watchdog = self.watchdog
-        beat = {"topic": self.topic.name, "type": self.topic.kind, "ready": self._ready, "zeros": watchdog.zeros,
+        beat = {"topic": self.topic.name, "type": self.topic.kind, "ready": self._ready,
                 "stops": watchdog.stops, "hears": sorted(watchdog.heard)}
         self._beat.publish(self._type(data=json.dumps(beat)))
 
@@ -198,7 +195,7 @@ class GuardLink:
         """Expect a guard of a command topic; `start` returns a new guard process, None where another one is used."""
         self.session, self.topic = session, topic
         self._stale = self.STALE * (SIMULATED if simulated else 1.0)
-        self.zeros = self.stops = 0
+        self.stops = 0
         self._start, self._process = start, None
         self._started = -self.RESTART
         self._heard: float | None = None
@@ -214,7 +211,7 @@ class GuardLink:
 
     def heard(self, now: float, text: str) -> bool:
         """Take a heartbeat of a guard; return whether it counts: not where a trusted one is there beside it."""
-        beat = read_beat(text, topic=str, type=str, ready=bool, zeros=int, stops=int, hears=list)
+        beat = read_beat(text, topic=str, type=str, ready=bool, stops=int, hears=list)
         if not beat:
             return False
         ours = beat["topic"] == self.topic and self.session in beat["hears"]
@@ -223,7 +220,7 @@ class GuardLink:
         if ours:
             self._trusted = now
         self._heard, self._beat = now, beat
-        self.zeros, self.stops = beat["zeros"], beat["stops"]
+        self.stops = beat["stops"]
         return True
 
     def problem(self, now: float) -> str:

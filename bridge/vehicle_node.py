@@ -181,8 +181,6 @@ class VehicleNode:
         if self._lock is not None:
             self._lock.follow(now, self.supervisor)
         self.supervisor.block(NO_GUARD, bool(self.guard.problem(now)))
-        if self._ear.foreign_zero():
-            self.supervisor.foreign_command(now)
         self._publish(self.decider.on_tick(now))
         steady = time.monotonic()
         if self.has_time(now) or steady - min(self._looked, self._said) > OVERDUE:
@@ -196,15 +194,14 @@ class VehicleNode:
         elif now - self._said >= STATUS_PERIOD:
             self._on_status()
 
-    def _on_command(self, v: float, omega: float) -> None:
-        if self._ear.heard(v, omega):
+    def _on_command(self, v: float, omega: float, marked: bool) -> None:
+        if self._ear.heard(v, omega, marked):
             self.supervisor.foreign_command(self.now())
 
     def _on_guard(self, message: Any) -> None:
         now = self.now()
         if not self.guard.heard(now, message.data):
             return
-        self._ear.guard_reports(self.guard.zeros)
         if self.guard.stops > self._guard_stops and self._lock is not None:
             self._lock.forget()  # the guard has unlocked it
         if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
