@@ -94,7 +94,6 @@ class VehicleNode:
         self._others = Commanders(time.monotonic())
         self._commanders: list[str] = []
         self._listeners: list[Endpoint] = []
-        self._guard_stops = 0
         node.create_subscription(Empty, ros.REARM_TOPIC, self._on_rearm, ros.reliable())
         ros.subscribe_own(node, String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
         self._inputs.subscribe(node, now, self._on_input)
@@ -199,14 +198,12 @@ class VehicleNode:
             self.supervisor.foreign_command(self.now())
 
     def _on_guard(self, message: Any) -> None:
-        now = self.now()
-        if not self.guard.heard(now, message.data):
+        if not self.guard.heard(self.now(), message.data):
             return
-        if self.guard.stops > self._guard_stops and self._lock is not None:
+        if self._lock is not None:
             self._lock.forget()  # the guard has unlocked it
-        if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
+        if self.supervisor.may_drive:
             self.supervisor.fault(GUARD_STOPPED)
-        self._guard_stops = self.guard.stops
 
     def _on_input(self, now: float) -> None:
         self._publish(self.decider.on_tick(now))

@@ -96,7 +96,7 @@ def test_guard_is_ready_when_every_reader_is_matched_the_bases_among_them(matche
     assert guard._ready == ready
 
 
-GOOD = {"topic": "/cmd_vel", "type": "Twist", "ready": True, "stops": 0, "hears": ["me"]}
+GOOD = {"guard": "ours", "topic": "/cmd_vel", "type": "Twist", "ready": True, "stops": 0, "hears": ["me"]}
 
 
 @pytest.mark.parametrize("change, problem", [
@@ -113,12 +113,34 @@ def test_bridge_trusts_only_a_guard_that_hears_it_and_reaches_its_base(change, p
 
 def test_guard_of_an_earlier_node_on_the_same_topics_does_not_disturb():
     link = GuardLink("me", "/cmd_vel", None)
+    dead = {**GOOD, "guard": "other", "hears": ["dead"], "ready": False}
     for i in range(20):
-        assert link.heard(1 + i / 20, json.dumps(GOOD))
-        assert not link.heard(1 + i / 20, json.dumps({**GOOD, "hears": ["dead"], "stops": 1}))
-        assert link.problem(1 + i / 20) == "" and link.stops == 0
-    link.heard(3.0, json.dumps({**GOOD, "hears": ["dead"]}))
+        assert not link.heard(1 + i / 20, json.dumps(GOOD))
+        assert not link.heard(1 + i / 20, json.dumps({**dead, "stops": i}))
+        assert link.problem(1 + i / 20) == ""
+    link.heard(3.0, json.dumps(dead))
     assert "does not hear" in link.problem(3.0)
+
+
+def test_each_of_two_guards_counts_its_own_stops_and_one_that_serves_is_enough():
+    link = GuardLink("me", "/cmd_vel", None)
+    further = {**GOOD, "guard": "further", "stops": 3, "ready": False}
+    for i in range(20):
+        assert not link.heard(1 + i / 20, json.dumps(GOOD))
+        assert not link.heard(1 + i / 20, json.dumps(further))
+        assert link.problem(1 + i / 20) == ""
+    assert link.heard(2.0, json.dumps({**further, "stops": 4}))
+    assert not link.heard(2.0, json.dumps({**further, "stops": 4}))
+    assert link.heard(2.0, json.dumps({**GOOD, "stops": 1}))
+    link.heard(3.0, json.dumps(further))
+    assert "would not reach" in link.problem(3.0)
+
+
+def test_guard_that_has_forgotten_a_paused_node_meanwhile_still_says_that_it_stopped_it():
+    link = GuardLink("me", "/cmd_vel", None)
+    assert not link.heard(1.0, json.dumps(GOOD))
+    assert link.heard(9.0, json.dumps({**GOOD, "hears": [], "stops": 1}))
+    assert not link.heard(9.0, json.dumps({**GOOD, "hears": [], "stops": 1}))
 
 
 class Process:
