@@ -360,6 +360,18 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
             signal.signal(number, handler)
 
 
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Take no notice of further signals while a node says goodbye: an impatient second Ctrl-C would cut it short."""
+    before = {number: signal.signal(number, lambda *_: None)
+              for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def spin_some(node: Any, seconds: float) -> None:
     """Serve the callbacks of a node that spins no more, for so long [s] at most."""
     executor = make_executor()

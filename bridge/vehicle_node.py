@@ -125,15 +125,18 @@ class VehicleNode:
         return {}
 
     def close(self) -> None:
-        """Leave the vehicle standing, the base to its rider, and no guard behind."""
-        stop = self.decider.farewell()
-        self._beat(driving=False)
-        if stop:
-            self.commands.publish_stops()
-        if self._lock is not None:
-            self.supervisor.latch("the node ends")  # callbacks run while the driver's answer is waited for
-            self._unlock(self._lock)
-        self.guard.close()
+        """Leave the vehicle standing, the base to its rider, and no guard behind.
+
+        The guard hears last that the drive is over, so it stops the vehicle where this is cut short.
+        """
+        with ros.undisturbed():
+            if self.decider.farewell():
+                self.commands.publish_stops()
+            self._beat(driving=False)
+            if self._lock is not None:
+                self.supervisor.latch("the node ends")  # callbacks run while the driver's answer is waited for
+                self._unlock(self._lock)
+            self.guard.close()
 
     def _unlock(self, lock: JoystickLock) -> None:
         """Give the chair its joystick back, and wait shortly for the driver's answer."""

@@ -11,6 +11,7 @@ import pytest
 from bridge import ros
 from bridge.commands import CommandTopic, Endpoint
 from bridge.guard import GuardLink, GuardNode, Watchdog, read_beat
+from bridge.vehicle_node import VehicleNode
 
 pytestmark = pytest.mark.quick
 
@@ -268,3 +269,24 @@ def test_guard_sends_nothing_to_a_new_listener_when_somebody_drives_or_nobody_wa
     guard.command(True)
     guard.new_listener(2.0)
     assert not silence(guard, 200, 300)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_guard_hears_that_a_drive_is_over_only_after_the_zeros(moves):
+    """So that it stops the vehicle where the goodbye is cut short."""
+    said, node = [], VehicleNode.__new__(VehicleNode)
+    node.decider = types.SimpleNamespace(farewell=lambda: moves)
+    node.commands = types.SimpleNamespace(publish_stops=lambda: said.append("zeros"))
+    node.guard = types.SimpleNamespace(session="me", close=lambda: said.append("guard ends"))
+    node._heartbeat = types.SimpleNamespace(publish=lambda beat: said.append(json.loads(beat)["driving"]))
+    node._string, node._lock = (lambda data: data), None
+    node.close()
+    assert said == ["zeros"] * moves + [False, "guard ends"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_further_signal_does_not_disturb_a_goodbye(number):
+    found = signal.getsignal(number)
+    with ros.undisturbed():
+        os.kill(os.getpid(), number)
+    assert signal.getsignal(number) == found
