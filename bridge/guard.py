@@ -194,6 +194,9 @@ class GuardLink:
     """Seconds between two starts of a guard that ended."""
     NOT_READY = "the guard's zeros would not reach the base"
 
+    kind = ""
+    """Type in which the node sends commands, as the base listens; empty while it is unknown."""
+
     def __init__(self, session: str, topic: str, start: Callable[[], Any] | None, simulated: bool = False) -> None:
         """Expect a guard of a command topic; `start` returns a new guard process, None where another one is used."""
         self.session, self.topic = session, topic
@@ -203,7 +206,9 @@ class GuardLink:
         self._beats: dict[str, tuple[float, dict[str, Any]]] = {}  # time and content of each guard's last heartbeat
 
     def keep(self, now: float) -> None:
-        """Start the guard, or start it again where it has ended."""
+        """Start the guard, or start it again where it has ended; end one that has chosen another type of commands."""
+        if self._process is not None and self.problem(now) == self._wrong_type:
+            self._process.terminate()
         ended = self._process is None or self._process.poll() is not None
         if self._start is not None and ended and now - self._started >= self.RESTART:
             self._process, self._started = self._start(), now
@@ -236,7 +241,13 @@ class GuardLink:
             return f"the guard follows {beat['topic']}, not {self.topic}"
         if not self._guards_us(beat):
             return "the guard does not hear this node"
+        if self.kind and beat["type"] not in ("", self.kind):
+            return self._wrong_type
         return "" if beat["ready"] else self.NOT_READY
+
+    @property
+    def _wrong_type(self) -> str:
+        return f"the guard's zeros are no {self.kind}, as the base listens to"
 
     def _guards_us(self, beat: dict[str, Any]) -> bool:
         return bool(beat["topic"] == self.topic and self.session in beat["hears"])

@@ -163,7 +163,8 @@ class VehicleNode:
 
     def _start_guard(self) -> Any:
         """Start a guard that outlives this process, its terminal included, by some seconds."""
-        arguments = ["--command-topic", self.commands.name, "--command-type", self.options.command_type,
+        arguments = ["--command-topic", self.commands.name,
+                     "--command-type", self.commands.kind or self.options.command_type,
                      "--follow", self.guard.session, "--realtime", str(self.options.realtime)]
         arguments += ["--joystick-lock"] if self.options.joystick_lock else []
         simulated = str(isinstance(self.now, VehicleTime)).lower()  # the guard counts in the same time
@@ -235,8 +236,9 @@ class VehicleNode:
     def _on_look(self) -> None:
         """Look at the graph: who listens, who else commands; keep the guard running."""
         now = time.monotonic()
-        self.guard.keep(now)
         self.commands.look()
+        self.guard.kind = self.commands.kind  # a tool that listens in another type must not mislead the guard
+        self.guard.keep(now)
         self._listeners = self.commands.listeners()
         self.supervisor.block(NO_BASE, not any(map(self.commands.hears_us, self._listeners)))
         self._mixed = [mixed(topic, found, "values") for topic, found in self._signals() if len(found) > 1]

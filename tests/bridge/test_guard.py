@@ -112,6 +112,30 @@ def test_bridge_trusts_only_a_guard_that_hears_it_and_reaches_its_base(change, p
     assert link.problem(2.0) == "no guard is running"
 
 
+def test_guard_that_sends_another_type_than_the_base_hears_is_none_and_is_started_again():
+    """A tool that listens in another type had misled it: its zeros would reach the tool alone."""
+    started = []
+
+    def start():
+        process = Process()
+        process.terminate = lambda: setattr(process, "returncode", 0)
+        started.append(process)
+        return process
+
+    link = GuardLink("me", "/cmd_vel", start)
+    link.kind = "TwistStamped"
+    link.keep(0.0)
+    link.heard(1.0, json.dumps({**GOOD, "type": ""}))
+    assert link.problem(1.0) == ""
+    link.heard(1.1, json.dumps(GOOD))
+    assert "no TwistStamped" in link.problem(1.1)
+    link.keep(1.2)
+    assert started[0].returncode == 0 and "ended" in link.problem(1.3)
+    link.keep(2.1)
+    link.heard(2.2, json.dumps({**GOOD, "guard": "second", "type": "TwistStamped"}))
+    assert len(started) == 2 and link.problem(2.2) == "" and started[1].returncode is None
+
+
 def test_guard_of_an_earlier_node_on_the_same_topics_does_not_disturb():
     link = GuardLink("me", "/cmd_vel", None)
     dead = {**GOOD, "guard": "other", "hears": ["dead"], "ready": False}
