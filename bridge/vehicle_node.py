@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from bridge import inputs, ros
 from bridge.bases import BASES
-from bridge.commands import Commanders, CommandTopic, Ear, Endpoint, endpoints
+from bridge.commands import Commanders, CommandListener, CommandTopic, Ear, Endpoint, endpoints
 from bridge.diagnosis import fitting, mixed
 from bridge.exits import OptionError
 from bridge.guard import BEAT_PERIOD, GuardLink
@@ -78,6 +78,7 @@ class VehicleNode:
         self.node, self.decider, self.options, self.now = node, decider, options, now
         self.supervisor = decider.supervisor
         self.commands = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
+        self._drivers = [CommandListener(node, topic, "auto", self._on_driver) for topic in options.yield_to]
         self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
                                self._start_guard if options.guard == "own" else None, isinstance(now, VehicleTime))
         self._inputs = inputs.SafetyInputs(self.supervisor, options)
@@ -201,6 +202,9 @@ class VehicleNode:
         if self._ear.heard(v, omega, marked):
             self.supervisor.foreign_command(self.now())
 
+    def _on_driver(self, v: float, omega: float, marked: bool) -> None:
+        self.supervisor.foreign_command(self.now())
+
     def _on_guard(self, message: Any) -> None:
         if not self.guard.heard(self.now(), message.data):
             return
@@ -236,7 +240,8 @@ class VehicleNode:
     def _on_look(self) -> None:
         """Look at the graph: who listens, who else commands; keep the guard running."""
         now = time.monotonic()
-        self.commands.look()
+        for topic in (self.commands, *self._drivers):
+            topic.look()
         self.guard.kind = self.commands.kind  # a tool that listens in another type must not mislead the guard
         self.guard.keep(now)
         self._listeners = self.commands.listeners()
@@ -304,6 +309,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="own: start a guard process; other: wait for one, such as a guard of another computer")
     parser.add_argument("--allow-other-commanders", action="store_true",
                         help="drive although another node could send commands; when it does, it drives")
+    parser.add_argument("--yield-to", type=topic_name, nargs="+", default=(), metavar="TOPIC",
+                        help="who sends commands on one of these topics drives, and an operator arms afterwards: of a "
+                             "twist_mux, each source that goes before this node")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
                         help="SCHED_FIFO priority, like 20")
     inputs.add_options(parser)

@@ -1,5 +1,6 @@
 """The robot's own wheel holds all that the robot needs and nothing of the training."""
 
+import ast
 import configparser
 import runpy
 import shlex
@@ -111,6 +112,17 @@ def test_launch_file_names_programs_of_the_package_and_topics_of_the_node(name):
     text = (ROOT / "bridge" / "launch" / f"{name}.launch.py").read_text(encoding="utf-8")
     compile(text, name, "exec")
     assert 'package="whill_bridge", executable="bridge_drive"' in text and f'"{ros.COMMAND_TOPIC}"' in text
+
+
+def test_policy_behind_a_mux_yields_to_each_source_that_goes_before_it():
+    yaml = pytest.importorskip("yaml")
+    mux = yaml.safe_load((ROOT / "bridge" / "config" / "twist_mux.yaml").read_text(encoding="utf-8"))
+    sources = mux["twist_mux"]["ros__parameters"]["topics"]
+    before = [one["topic"] for one in sources.values() if one["priority"] > sources["policy"]["priority"]]
+    text = (ROOT / "bridge" / "launch" / "twist_mux.launch.py").read_text(encoding="utf-8")
+    given = [ast.literal_eval(node) for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Dict)]
+    (yields,) = [one["yield_to"] for one in given if "yield_to" in one]
+    assert sorted(yields) == sorted(before)
 
 
 def service_unit():
