@@ -191,6 +191,19 @@ class Robot:
         self.wait_until(lambda _: publisher.get_subscription_count())
         publisher.publish(message_type("std_msgs/Empty")())
 
+    def drive_again(self, seconds: float = 120, again: float = 1.0) -> None:
+        """Arm until the bridge drives: again each second, since on a busy computer a moment's hold may refuse it."""
+        pressed = -again
+
+        def drives(robot: Robot) -> bool:
+            nonlocal pressed
+            if time.monotonic() - pressed > again and not robot.statuses[-1]["driving"]:
+                robot.arm()
+                pressed = time.monotonic()
+            return bool(robot.statuses[-1]["driving"])
+
+        self.wait_until(drives, seconds)
+
     def wait_until(self, condition: Callable[[Robot], Any], seconds: float = 120) -> Any:
         """Wait for a condition of this robot and return its value.
 

@@ -1,5 +1,6 @@
 """The command topic: who listens in which type, who else publishes, and whose each command is."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -17,62 +18,52 @@ SETTLE = 1.0
 """Seconds in which nodes that run already have found one another, on a loaded computer too."""
 HEARD_DEPTH = 50
 """Commands that may wait to be heard, so that none of another node is overwritten by ours."""
-GUARD_REPORTS = 3
-"""A zero that this many later reports of the guard do not count came from somebody else; it reports each 50 ms."""
-FORGET_REPORTS = 20
-"""Reports after which a zero of the guard that we never heard is taken for lost."""
+GUARD_SIGNS = (1.0, -1.0, 1.0, -1.0)
+"""Signs of linear.y, linear.z, angular.x and angular.y in a zero of the guard. To a base -0.0 is 0, and DDS keeps the
+sign. Other nodes leave these four at 0.0, or negate all of them."""
 
 
 class Ear:
-    """Separates our own commands, the guard's zeros and the commands of other nodes; pure.
+    """Separates our own commands, zeros of a guard and the commands of other nodes; pure.
 
-    ROS does not name the sender of a message. So we compare each command heard with those we sent, exactly. The guard
-    reports how many zeros it has sent. We count its reports instead of seconds, so a pause does no harm.
+    ROS does not name the sender of a message, on Humble in no way at all. So a guard marks its zeros (`mark_zero`), and
+    each other command is compared exactly with those that we sent. Neither needs times or counts, so nothing depends on
+    who is heard first, on pauses, or on the restart of a guard.
     """
 
     def __init__(self) -> None:
         self._own: deque[tuple[float, float]] = deque(maxlen=64)
-        self._reports = 0
-        self._guard_zeros: int | None = None
-        self._unknown: deque[int] = deque()  # report number at each zero that neither we nor the guard is known to send
-        self._unheard: deque[int] = deque()  # report number at each zero of the guard that we have not heard yet
 
     def sent(self, v: float, omega: float) -> None:
         """Remember a command of ours."""
         self._own.append((v, omega))
 
-    def heard(self, v: float, omega: float) -> bool:
-        """Take a command from the topic; return whether another node surely sent it."""
-        if (v, omega) in self._own:
-            if v == omega == 0:
-                self._own.remove((v, omega))  # it may be the guard's, and earlier ones of ours still on their way
-                return False
-            while self._own.popleft() != (v, omega):
-                pass  # earlier ones were lost on the way
+    def heard(self, v: float, omega: float, marked: bool) -> bool:
+        """Take a command from the topic; return whether another node sent it.
+
+        Args:
+            v: [m/s].
+            omega: [rad/s].
+            marked: whether it bears the mark of a guard, which sends nothing but zeros.
+        """
+        if marked and v == omega == 0:
             return False
-        if v != 0 or omega != 0:
+        if (v, omega) not in self._own:
             return True
-        self._unknown.append(self._reports)
+        while self._own.popleft() != (v, omega):
+            pass  # earlier ones were lost on the way: one reader hears one sender in order
         return False
 
-    def guard_reports(self, zeros: int) -> None:
-        """Take the number of zeros that the guard has sent so far; a smaller number comes from a restarted guard."""
-        self._reports += 1
-        before = zeros if self._guard_zeros is None else self._guard_zeros
-        self._unheard.extend([self._reports] * (zeros - before if zeros >= before else zeros))
-        self._guard_zeros = zeros
 
-    def foreign_zero(self) -> bool:
-        """Return whether a zero was heard that neither we nor the guard can have sent."""
-        while self._unheard and self._unknown:
-            self._unheard.popleft()
-            self._unknown.popleft()
-        while self._unheard and self._reports - self._unheard[0] > FORGET_REPORTS:
-            self._unheard.popleft()
-        if not self._unknown or self._reports - self._unknown[0] < GUARD_REPORTS:
-            return False
-        self._unknown.clear()
-        return True
+def mark_zero(planar: Any) -> None:
+    """Mark a geometry_msgs/Twist as a zero of the guard."""
+    planar.linear.y, planar.linear.z, planar.angular.x, planar.angular.y = (0.0 * sign for sign in GUARD_SIGNS)
+
+
+def is_marked(planar: Any) -> bool:
+    """Return whether a geometry_msgs/Twist bears the mark of the guard."""
+    rest = planar.linear.y, planar.linear.z, planar.angular.x, planar.angular.y
+    return not any(rest) and all(math.copysign(1.0, a) == b for a, b in zip(rest, GUARD_SIGNS, strict=True))
 
 
 class Commanders:
@@ -144,14 +135,16 @@ class CommandListener:
     One participant can use a topic in one type only, so the topic is opened when its type is known.
     """
 
-    def __init__(self, node: Any, topic: str, kind: str, on_command: Callable[[float, float], None]) -> None:
+    def __init__(self, node: Any, topic: str, kind: str, on_command: Callable[[float, float, bool], None]
+                 ) -> None:
         """Prepare the topic.
 
         Args:
             node: ROS node.
             topic: its name, resolved by the node's namespace and remappings.
             kind: Twist, TwistStamped, or auto: as the base listens.
-            on_command: called with v [m/s] and omega [rad/s] of every command on the topic, our own ones too.
+            on_command: called with v [m/s] and omega [rad/s] of every command on the topic, our own ones too, and with
+                whether it bears the mark of a guard.
         """
         self.node, self.name = node, node.resolve_topic_name(topic)
         self.kind = ""
@@ -173,20 +166,25 @@ class CommandListener:
                 for endpoint, info in zip(endpoints(infos), infos, strict=True)]
 
     def listeners(self) -> list[Endpoint]:
-        """Return who listens to commands, without the bridge's own nodes and those whose name is not known yet."""
-        return [endpoint for endpoint in without(self.readers(), *self._known) if UNKNOWN not in endpoint.node]
+        """Return who listens to commands, without those whose name is not known yet and nodes of the bridge.
+
+        DDS lists a node that was killed beside its successor for 20 s: none of the two is a base.
+        """
+        return [one for one in self.readers() if one.node not in self._known and UNKNOWN not in one.node]
 
     def hears_us(self, endpoint: Endpoint) -> bool:
         """Return whether a listener gets the commands of this topic, by its type and its quality of service."""
         return bool(self.kind) and endpoint.type.endswith("/" + self.kind) and endpoint.hears
 
     def commanders(self) -> list[str]:
-        """Return the names of all other nodes that publish commands; one guard beside us is not among them.
+        """Return the names of all other nodes that publish commands, guards left out.
 
-        The graph knows a node's endpoint before its name: such a name contains `UNKNOWN`, the guard's own too.
+        A guard sends nothing but zeros, and DDS lists one that was killed beside its successor for 20 s. What else a
+        node of that name sends is noticed when it comes. The graph knows a node's endpoint before its name: such a name
+        contains `UNKNOWN`, the guard's own too.
         """
-        found = endpoints(self.node.get_publishers_info_by_topic(self.name))
-        return sorted(endpoint.node for endpoint in without(found, self._own, self._guard))
+        found = without(endpoints(self.node.get_publishers_info_by_topic(self.name)), self._own)
+        return sorted(endpoint.node for endpoint in found if endpoint.node != self._guard)
 
     def look(self) -> bool:
         """Open the topic as soon as its type is known; return whether it is open."""
@@ -206,7 +204,7 @@ class CommandListener:
 
         def heard(message: Any) -> None:
             planar = message.twist if kind == "TwistStamped" else message
-            self._on_command(planar.linear.x, planar.angular.z)
+            self._on_command(planar.linear.x, planar.angular.z, is_marked(planar))
 
         ros.subscribe_own(self.node, self._message, self.name, heard, ros.best_effort(HEARD_DEPTH))
 
@@ -216,8 +214,8 @@ class CommandTopic(CommandListener):
 
     publisher: Any = None
 
-    def publish(self, v: float, omega: float) -> None:
-        """Send one command, where the topic is open."""
+    def publish(self, v: float, omega: float, marked: bool = False) -> None:
+        """Send one command, where the topic is open; `marked` is a zero of the guard."""
         if self.publisher is None:
             return
         message = planar = self._message()
@@ -226,6 +224,8 @@ class CommandTopic(CommandListener):
             message.header.frame_id = "base_link"
             planar = message.twist
         planar.linear.x, planar.angular.z = float(v), float(omega)
+        if marked:
+            mark_zero(planar)
         self.publisher.publish(message)
 
     def publish_stops(self, count: int = 5, interval: float = 0.02) -> None:

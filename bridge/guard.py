@@ -13,6 +13,7 @@ import math
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Callable
 from typing import Any
 
@@ -50,8 +51,6 @@ class Watchdog:
         """Seconds after which a driving node that gave no sign of life is stopped."""
         self.stops = 0
         """How often a node was found silent while it drove."""
-        self.zeros = 0
-        """Zeros sent so far."""
         self.abandoned = False
         """Whether a node fell silent while it drove, or all that were heard are gone, and none was heard since."""
         self.heard: dict[str, float] = {}
@@ -100,7 +99,7 @@ class Watchdog:
                 del self.heard[session]
                 self.abandoned = self.abandoned or not self.heard
         if self._left and now >= self._next:
-            self._left, self._next, self.zeros = self._left - 1, now + 0.05, self.zeros + 1
+            self._left, self._next = self._left - 1, now + 0.05
             return True
         return False
 
@@ -119,6 +118,7 @@ class GuardNode:
             self.now, self.watchdog = (vehicle_time := VehicleTime()), Watchdog(SIMULATED * SILENCE)
             ros.subscribe_clock(node, lambda _: vehicle_time.on_clock())
         self._ready, self._matched = False, 0
+        self._name = uuid.uuid4().hex
         self._lock = JoystickLock(ros.joystick_locker(node)) if options.joystick_lock else None
         self._type = String
         self.topic = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
@@ -132,7 +132,7 @@ class GuardNode:
         """Return whether the one node that this guard follows is gone."""
         return bool(self._follow) and time.monotonic() - self._followed > 2 * FORGET
 
-    def _on_command(self, v: float, omega: float) -> None:
+    def _on_command(self, v: float, omega: float, marked: bool) -> None:
         self.watchdog.command(v != 0 or omega != 0)  # not-finite values compare unequal to 0: they count as motion
 
     def _on_heartbeat(self, message: Any) -> None:
@@ -144,8 +144,7 @@ class GuardNode:
     def _on_watch(self) -> None:
         stops = self.watchdog.stops
         if self.watchdog.tick(self.now()):
-            self._on_beat()  # first, so that nobody takes the zero for a stranger's
-            self.topic.publish(0.0, 0.0)
+            self.topic.publish(0.0, 0.0, marked=True)
         if self._lock is not None and self.watchdog.abandoned:
             self._lock.want(time.monotonic(), False)  # it outlives the node that asked for it
         elif self._lock is not None:
@@ -156,7 +155,7 @@ class GuardNode:
 
     def _on_beat(self) -> None:
         watchdog = self.watchdog
-        beat = {"topic": self.topic.name, "type": self.topic.kind, "ready": self._ready, "zeros": watchdog.zeros,
+        beat = {"guard": self._name, "topic": self.topic.name, "type": self.topic.kind, "ready": self._ready,
                 "stops": watchdog.stops, "hears": sorted(watchdog.heard)}
         self._beat.publish(self._type(data=json.dumps(beat)))
 
@@ -193,50 +192,65 @@ class GuardLink:
     """A guard that was not heard for this long [s] is not there."""
     RESTART = 2.0
     """Seconds between two starts of a guard that ended."""
+    NOT_READY = "the guard's zeros would not reach the base"
+
+    kind = ""
+    """Type in which the node sends commands, as the base listens; empty while it is unknown."""
 
     def __init__(self, session: str, topic: str, start: Callable[[], Any] | None, simulated: bool = False) -> None:
         """Expect a guard of a command topic; `start` returns a new guard process, None where another one is used."""
         self.session, self.topic = session, topic
         self._stale = self.STALE * (SIMULATED if simulated else 1.0)
-        self.zeros = self.stops = 0
         self._start, self._process = start, None
         self._started = -self.RESTART
-        self._heard: float | None = None
-        self._trusted = -self.STALE  # time of the last beat of a guard that hears us
-        self._beat: dict[str, Any] = {}
+        self._beats: dict[str, tuple[float, dict[str, Any]]] = {}  # time and content of each guard's last heartbeat
 
     def keep(self, now: float) -> None:
-        """Start the guard, or start it again where it has ended."""
+        """Start the guard, or start it again where it has ended; end one that has chosen another type of commands."""
+        if self._process is not None and self.problem(now) == self._wrong_type:
+            self._process.terminate()
         ended = self._process is None or self._process.poll() is not None
         if self._start is not None and ended and now - self._started >= self.RESTART:
             self._process, self._started = self._start(), now
-            self._heard, self._trusted = None, -self.STALE  # what the one before said counts no more
+            self._beats.clear()  # what the one before said counts no more
 
     def heard(self, now: float, text: str) -> bool:
-        """Take a heartbeat of a guard; return whether it counts: not where a trusted one is there beside it."""
-        beat = read_beat(text, topic=str, type=str, ready=bool, zeros=int, stops=int, hears=list)
+        """Take a heartbeat of a guard; return whether it says that this guard, which heard us, has stopped a node.
+
+        There may be several, such as that of an earlier node that was killed. Each counts its own stops.
+        """
+        beat = read_beat(text, guard=str, topic=str, type=str, ready=bool, stops=int, hears=list)
         if not beat:
             return False
-        ours = beat["topic"] == self.topic and self.session in beat["hears"]
-        if not ours and now - self._trusted < self._stale:
-            return False  # a second guard, such as that of an earlier node that was killed
-        if ours:
-            self._trusted = now
-        self._heard, self._beat = now, beat
-        self.zeros, self.stops = beat["zeros"], beat["stops"]
-        return True
+        name = beat["guard"]
+        before = self._beats.get(name, (now, beat))[1]
+        self._beats[name] = now, beat
+        return self._guards_us(before) and beat["stops"] > before["stops"]
 
     def problem(self, now: float) -> str:
         """Return why nobody would stop the vehicle if this process died; empty where a guard would."""
         if self._process is not None and self._process.poll() is not None:
             return f"the guard ended with code {self._process.returncode}"
-        if self._heard is None or now - self._heard > self._stale:
+        beats = [beat for heard, beat in self._beats.values() if now - heard <= self._stale]
+        if not beats:
             return "no guard is running"
-        if self._beat["topic"] != self.topic:
-            return f"the guard follows {self._beat['topic']}, not {self.topic}"
-        if self.session not in self._beat["hears"]:
+        return min(map(self._problem_of, beats), key=lambda why: (bool(why), why != self.NOT_READY))
+
+    def _problem_of(self, beat: dict[str, Any]) -> str:
+        if beat["topic"] != self.topic:
+            return f"the guard follows {beat['topic']}, not {self.topic}"
+        if not self._guards_us(beat):
             return "the guard does not hear this node"
-        return "" if self._beat["ready"] else "the guard's zeros would not reach the base"
+        if self.kind and beat["type"] not in ("", self.kind):
+            return self._wrong_type
+        return "" if beat["ready"] else self.NOT_READY
+
+    @property
+    def _wrong_type(self) -> str:
+        return f"the guard's zeros are no {self.kind}, as the base listens to"
+
+    def _guards_us(self, beat: dict[str, Any]) -> bool:
+        return bool(beat["topic"] == self.topic and self.session in beat["hears"])
 
     def close(self) -> None:
         """End the guard that was started."""

@@ -189,9 +189,10 @@ class ManoeuvreNode(VehicleNode):
 
     def close(self) -> None:
         """End the node, and the recording of a replicate that is on its way."""
-        super().close()
-        if self._recorder is not None and self._recorder.writer is not None:
-            self._end_recording(self._recorder)
+        with ros.undisturbed():
+            super().close()
+            if self._recorder is not None and self._recorder.writer is not None:
+                self._end_recording(self._recorder)
 
     def _trial_name(self) -> str:
         return f"{self.options.trial}_{self.options.first + self.player.driven}"

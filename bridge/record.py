@@ -87,7 +87,7 @@ class StampedListener(CommandListener):
         self._on_message = on_message
         self.lost = 0
         """Commands that the middleware reports as lost."""
-        super().__init__(node, topic, "auto", lambda v, omega: None)
+        super().__init__(node, topic, "auto", lambda v, omega, marked: None)
 
     def _open(self, kind: str) -> None:
         from geometry_msgs import msg

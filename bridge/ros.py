@@ -360,6 +360,18 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
             signal.signal(number, handler)
 
 
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Take no notice of further signals while a node says goodbye: an impatient second Ctrl-C would cut it short."""
+    before = {number: signal.signal(number, lambda *_: None)
+              for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def spin_some(node: Any, seconds: float) -> None:
     """Serve the callbacks of a node that spins no more, for so long [s] at most."""
     executor = make_executor()
@@ -421,11 +433,18 @@ def stamp_seconds(stamp: Any) -> float:
 
 
 def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split a command line into our arguments and those from `--ros-args` on."""
-    if "--ros-args" not in arguments:
-        return arguments, []
-    at = arguments.index("--ros-args")
-    return arguments[:at], arguments[at:]
+    """Split a command line into our arguments and those of ROS, of which each `--ros-args` ends at a `--`."""
+    own: list[str] = []
+    of_ros: list[str] = []
+    here = own
+    for word in arguments:
+        if word == "--ros-args":
+            here = of_ros
+        elif word == "--" and here is of_ros:
+            here = own
+        else:
+            here.append(word)
+    return own, ["--ros-args", *of_ros] if "--ros-args" in arguments else []
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

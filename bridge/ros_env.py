@@ -78,7 +78,7 @@ class RosEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._next_step = -np.inf
         self._commands = None
         if self._client is None:
-            self._commands = CommandTopic(self._node, command_topic, "auto", lambda v, omega: None)
+            self._commands = CommandTopic(self._node, command_topic, "auto", lambda v, omega, marked: None)
         profile = ros.best_effort() if self._client is None else ros.reliable(10)
         self._node.create_subscription(Image, image_topic, self._on_image, profile)
         if self._client is not None:

@@ -44,7 +44,7 @@ def rays_of(scan: Scan, sensor: SensorInput) -> np.ndarray:
     """Return the distances (rays,) float32 [m] that a policy's lidar would show: of the beam nearest to each ray.
 
     A beam without a return, or outside the scanner's range, shows the reach; one that met something too close to be
-    measured (-inf) shows the scanner's least range.
+    measured (-inf) shows the scanner's least range. Where no beam gives any, the scanner is blind, not the hall wide.
 
     Raises:
         SenseError: the scan is damaged, or does not look where a ray of the policy does.
@@ -53,8 +53,9 @@ def rays_of(scan: Scan, sensor: SensorInput) -> np.ndarray:
     if not (len(ranges) and math.isfinite(step) and step and math.isfinite(scan.angle_min)):
         raise SenseError(f"scan of {len(ranges)} beams, {step:g} rad apart from {scan.angle_min:g} rad: there must be "
                          "some, at an angle. Correct the publisher.")
-    if np.isnan(ranges).all():
-        raise SenseError("scan without a single valid range: the scanner is blind. Check it.")
+    if not ((ranges >= scan.range_min) | (ranges == -np.inf)).any():  # a wide hall has inf, a hung scanner zeros
+        raise SenseError(f"scan without a single valid range (all are below {scan.range_min:g} m or no numbers): the "
+                         "scanner is blind. Check it.")
     rays, fov = sensor.shape[0], float(sensor.settings.get("fov", FULL_TURN))
     reach = float(sensor.settings.get("reach", REACH))
     angles = fov * ((np.arange(rays) + 0.5) / rays - 0.5)

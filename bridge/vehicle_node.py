@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from bridge import inputs, ros
 from bridge.bases import BASES
-from bridge.commands import Commanders, CommandTopic, Ear, Endpoint, endpoints
+from bridge.commands import Commanders, CommandListener, CommandTopic, Ear, Endpoint, endpoints
 from bridge.diagnosis import fitting, mixed
 from bridge.exits import OptionError
 from bridge.guard import BEAT_PERIOD, GuardLink
@@ -78,6 +78,7 @@ class VehicleNode:
         self.node, self.decider, self.options, self.now = node, decider, options, now
         self.supervisor = decider.supervisor
         self.commands = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
+        self._drivers = [CommandListener(node, topic, "auto", self._on_driver) for topic in options.yield_to]
         self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
                                self._start_guard if options.guard == "own" else None, isinstance(now, VehicleTime))
         self._inputs = inputs.SafetyInputs(self.supervisor, options)
@@ -94,7 +95,6 @@ class VehicleNode:
         self._others = Commanders(time.monotonic())
         self._commanders: list[str] = []
         self._listeners: list[Endpoint] = []
-        self._guard_stops = 0
         node.create_subscription(Empty, ros.REARM_TOPIC, self._on_rearm, ros.reliable())
         ros.subscribe_own(node, String, ros.GUARD_TOPIC, self._on_guard, ros.reliable(10))
         self._inputs.subscribe(node, now, self._on_input)
@@ -126,15 +126,18 @@ class VehicleNode:
         return {}
 
     def close(self) -> None:
-        """Leave the vehicle standing, the base to its rider, and no guard behind."""
-        stop = self.decider.farewell()
-        self._beat(driving=False)
-        if stop:
-            self.commands.publish_stops()
-        if self._lock is not None:
-            self.supervisor.latch("the node ends")  # callbacks run while the driver's answer is waited for
-            self._unlock(self._lock)
-        self.guard.close()
+        """Leave the vehicle standing, the base to its rider, and no guard behind.
+
+        The guard hears last that the drive is over, so it stops the vehicle where this is cut short.
+        """
+        with ros.undisturbed():
+            if self.decider.farewell():
+                self.commands.publish_stops()
+            self._beat(driving=False)
+            if self._lock is not None:
+                self.supervisor.latch("the node ends")  # callbacks run while the driver's answer is waited for
+                self._unlock(self._lock)
+            self.guard.close()
 
     def _unlock(self, lock: JoystickLock) -> None:
         """Give the chair its joystick back, and wait shortly for the driver's answer."""
@@ -161,7 +164,8 @@ class VehicleNode:
 
     def _start_guard(self) -> Any:
         """Start a guard that outlives this process, its terminal included, by some seconds."""
-        arguments = ["--command-topic", self.commands.name, "--command-type", self.options.command_type,
+        arguments = ["--command-topic", self.commands.name,
+                     "--command-type", self.commands.kind or self.options.command_type,
                      "--follow", self.guard.session, "--realtime", str(self.options.realtime)]
         arguments += ["--joystick-lock"] if self.options.joystick_lock else []
         simulated = str(isinstance(self.now, VehicleTime)).lower()  # the guard counts in the same time
@@ -181,8 +185,6 @@ class VehicleNode:
         if self._lock is not None:
             self._lock.follow(now, self.supervisor)
         self.supervisor.block(NO_GUARD, bool(self.guard.problem(now)))
-        if self._ear.foreign_zero():
-            self.supervisor.foreign_command(now)
         self._publish(self.decider.on_tick(now))
         steady = time.monotonic()
         if self.has_time(now) or steady - min(self._looked, self._said) > OVERDUE:
@@ -196,20 +198,20 @@ class VehicleNode:
         elif now - self._said >= STATUS_PERIOD:
             self._on_status()
 
-    def _on_command(self, v: float, omega: float) -> None:
-        if self._ear.heard(v, omega):
+    def _on_command(self, v: float, omega: float, marked: bool) -> None:
+        if self._ear.heard(v, omega, marked):
             self.supervisor.foreign_command(self.now())
 
+    def _on_driver(self, v: float, omega: float, marked: bool) -> None:
+        self.supervisor.foreign_command(self.now())
+
     def _on_guard(self, message: Any) -> None:
-        now = self.now()
-        if not self.guard.heard(now, message.data):
+        if not self.guard.heard(self.now(), message.data):
             return
-        self._ear.guard_reports(self.guard.zeros)
-        if self.guard.stops > self._guard_stops and self._lock is not None:
+        if self._lock is not None:
             self._lock.forget()  # the guard has unlocked it
-        if self.guard.stops > self._guard_stops and self.supervisor.may_drive:
+        if self.supervisor.may_drive:
             self.supervisor.fault(GUARD_STOPPED)
-        self._guard_stops = self.guard.stops
 
     def _on_input(self, now: float) -> None:
         self._publish(self.decider.on_tick(now))
@@ -238,8 +240,10 @@ class VehicleNode:
     def _on_look(self) -> None:
         """Look at the graph: who listens, who else commands; keep the guard running."""
         now = time.monotonic()
+        for topic in (self.commands, *self._drivers):
+            topic.look()
+        self.guard.kind = self.commands.kind  # a tool that listens in another type must not mislead the guard
         self.guard.keep(now)
-        self.commands.look()
         self._listeners = self.commands.listeners()
         self.supervisor.block(NO_BASE, not any(map(self.commands.hears_us, self._listeners)))
         self._mixed = [mixed(topic, found, "values") for topic, found in self._signals() if len(found) > 1]
@@ -305,6 +309,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="own: start a guard process; other: wait for one, such as a guard of another computer")
     parser.add_argument("--allow-other-commanders", action="store_true",
                         help="drive although another node could send commands; when it does, it drives")
+    parser.add_argument("--yield-to", type=topic_name, nargs="+", default=(), metavar="TOPIC",
+                        help="who sends commands on one of these topics drives, and an operator arms afterwards: of a "
+                             "twist_mux, each source that goes before this node")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
                         help="SCHED_FIFO priority, like 20")
     inputs.add_options(parser)

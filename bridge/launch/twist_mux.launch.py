@@ -4,7 +4,8 @@
 
 The policy sends to policy/cmd_vel, nav2's velocity smoother to nav/cmd_vel_smoothed, the joystick to joy/cmd_vel; only
 twist_mux sends to the base. twist_mux itself drops a silent source after its timeout. The base must stop by itself when
-nobody speaks, as the WHILL does after 200 ms.
+nobody speaks, as the WHILL does after 200 ms. The policy yields to the other two and then waits to be armed: else it
+would drive off as soon as a person lets go of the joystick.
 """
 
 from pathlib import Path
@@ -22,7 +23,8 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
         DeclareLaunchArgument("policy", description="policy file: a folder or a zip of it"),
         Node(package="whill_bridge", executable="bridge_drive", name="bridge_drive", output="screen",
-             parameters=[str(config / "whill.yaml")], arguments=[LaunchConfiguration("policy")],
+             parameters=[str(config / "whill.yaml"), {"yield_to": ["joy/cmd_vel", "nav/cmd_vel_smoothed"]}],
+             arguments=[LaunchConfiguration("policy")],
              remappings=[("whill/controller/cmd_vel", "policy/cmd_vel")]),
         Node(package="nav2_velocity_smoother", executable="velocity_smoother", name="velocity_smoother",
              parameters=[{"smoothing_frequency": 20.0, "velocity_timeout": 0.2}],

@@ -5,15 +5,21 @@ import types
 import numpy as np
 import pytest
 
-from bridge.commands import NAMELESS, UNKNOWN, Commanders, CommandListener, Ear, Endpoint, choose_type, without
+from bridge.commands import (
+    NAMELESS,
+    UNKNOWN,
+    Commanders,
+    CommandListener,
+    Ear,
+    Endpoint,
+    choose_type,
+    is_marked,
+    mark_zero,
+    without,
+)
 
 pytestmark = pytest.mark.quick
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
-
-
-def reports(ear, *zeros):
-    """Let the guard report; return whether a foreign zero was found at any report."""
-    return any([(ear.guard_reports(count), ear.foreign_zero())[1] for count in zeros])
 
 
 def test_own_commands_are_never_taken_for_those_of_another_even_where_some_are_lost():
@@ -23,58 +29,59 @@ def test_own_commands_are_never_taken_for_those_of_another_even_where_some_are_l
         command = (float(rng.choice([0.0, 0.1, rng.normal()])), 0.0)
         ear.sent(*command)
         if rng.random() < 0.9:
-            assert not ear.heard(*command)
-        assert not reports(ear, 0, 0)
+            assert not ear.heard(*command, marked=False)
 
 
-@pytest.mark.parametrize("foreign", [(9.0, 0.0), (0.0, 0.1), (float("nan"), 0.0), (0.1000001, 0.0)])
+@pytest.mark.parametrize("foreign", [(9.0, 0.0), (0.0, 0.1), (float("nan"), 0.0), (0.1000001, 0.0), (0.0, 0.0)])
 def test_command_that_nobody_of_ours_sent_is_foreign_at_once(foreign):
     ear = Ear()
     ear.sent(0.1, 0.0)
-    assert ear.heard(*foreign)
-    assert not ear.heard(0.1, 0.0)
+    assert ear.heard(*foreign, marked=False)
+    assert not ear.heard(0.1, 0.0, marked=False)
 
 
-def test_zero_of_another_node_is_noticed_but_the_guards_zeros_are_not_taken_for_it():
-    ear = Ear()
-    assert not reports(ear, 7, 9)  # seven stops before this bridge began
-    assert not ear.heard(0.0, 0.0) and not ear.heard(0.0, 0.0)
-    assert not reports(ear, 9, 9, 9, 9)
-    assert not ear.heard(0.0, 0.0)
-    assert not reports(ear, 9, 9) and reports(ear, 9) and not reports(ear, 9, 9, 9)
+def test_zeros_of_a_guard_are_nobody_elses_in_whatever_order_and_number_they_come():
+    """Of our own guard, of one that was killed, or of an earlier node's: heard before or after its first report."""
+    rng = np.random.default_rng(1)
+    ear, waiting = Ear(), []
+    for _ in range(1000):
+        assert not ear.heard(0.0, 0.0, marked=True)
+        waiting.append((float(rng.choice([0.0, 0.3])), 0.0))
+        ear.sent(*waiting[-1])
+        while waiting and rng.random() < 0.5:
+            assert not ear.heard(*waiting.pop(0), marked=False)
 
 
-def test_zero_of_the_guard_may_overtake_our_own_commands():
-    """They come from two nodes, so nothing orders them: on a busy computer ours were taken for a stranger's."""
-    ear = Ear()
-    reports(ear, 0)
-    for v in (0.3, 0.2, 0.0):
-        ear.sent(v, 0.0)
-    assert not ear.heard(0.0, 0.0)  # of the guard
-    assert not any(ear.heard(v, 0.0) for v in (0.3, 0.2, 0.0))
-    assert not reports(ear, 1, 1, 1, 1, 1)
+def test_mark_of_a_guard_excuses_no_motion():
+    assert Ear().heard(0.1, 0.0, marked=True)
 
 
-def test_zero_heard_before_the_guard_reports_it_is_the_guards_however_long_that_takes():
-    ear = Ear()
-    reports(ear, 0)
-    ear.heard(0.0, 0.0)
-    assert not any(ear.foreign_zero() for _ in range(1000))  # this process was paused, or the guard was
-    assert not reports(ear, 1, 1, 1, 1, 1)
+def twist(*rest):
+    """A made-up Twist with linear.y, linear.z, angular.x and angular.y; x and yaw rate are zero."""
+    y, z, roll, pitch = rest or (0.0,) * 4
+    return types.SimpleNamespace(linear=types.SimpleNamespace(x=0.0, y=y, z=z),
+                                 angular=types.SimpleNamespace(x=roll, y=pitch, z=0.0))
 
 
-def test_report_of_a_zero_that_was_lost_excuses_no_later_one():
-    ear = Ear()
-    assert not reports(ear, 0, *[1] * 30)
-    ear.heard(0.0, 0.0)
-    assert reports(ear, 1, 1, 1)
+def test_marked_zero_is_a_zero_to_every_base():
+    zero = twist()
+    assert not is_marked(zero)
+    mark_zero(zero)
+    assert is_marked(zero) and zero == twist()
 
 
-def test_restarted_guard_counts_from_zero_again():
-    ear = Ear()
-    reports(ear, 12)
-    ear.heard(0.0, 0.0), ear.heard(0.0, 0.0)
-    assert not reports(ear, 2, 2, 2, 2, 2)
+@pytest.mark.parametrize("rest", [(-0.0,) * 4, (0.0, -0.0, 0.0, 0.0), (0.0, -0.1, 0.0, -0.0), (-0.0, 0.0, -0.0, 0.0),
+                                  (float("nan"), -0.0, 0.0, -0.0)])
+def test_zero_of_another_node_is_not_marked(rest):
+    assert not is_marked(twist(*rest))
+
+
+def test_mark_of_a_guard_crosses_a_message():
+    messages = pytest.importorskip("geometry_msgs.msg")
+    serialization = pytest.importorskip("rclpy.serialization")
+    zero = messages.Twist()
+    mark_zero(zero)
+    assert is_marked(serialization.deserialize_message(serialization.serialize_message(zero), messages.Twist))
 
 
 @pytest.mark.parametrize("types, chosen", [
@@ -92,7 +99,7 @@ def test_second_node_of_the_same_name_is_somebody_else():
 
 
 def test_neither_the_bridges_own_nodes_nor_one_without_a_name_yet_is_a_base(monkeypatch):
-    names = [("/", "bridge_drive"), ("/", "bridge_guard"), ("/", "bridge_record"),
+    names = [("/", "bridge_drive"), ("/", "bridge_guard"), ("/", "bridge_guard"), ("/", "bridge_record"),
              ("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_"), ("/left", "bridge_guard"), ("/", "base")]
     monkeypatch.setattr("bridge.commands.ros.hears_commands", lambda requested: True)
     infos = [types.SimpleNamespace(node_namespace=space, node_name=name, topic_type=TWIST, qos_profile=None)
@@ -102,6 +109,17 @@ def test_neither_the_bridges_own_nodes_nor_one_without_a_name_yet_is_a_base(monk
         get_subscriptions_info_by_topic=lambda topic: infos)
     listener = CommandListener(node, "cmd_vel", "auto", print)
     assert [end.node for end in listener.listeners()] == ["/left/bridge_guard", "/base"]
+
+
+def test_guard_that_was_killed_and_is_still_listed_is_no_commander_beside_its_successor():
+    names = [("/", "bridge_drive"), ("/", "bridge_guard"), ("/", "bridge_guard"), ("/left", "bridge_guard"),
+             ("/", "planner"), ("/", "bridge_drive")]
+    infos = [types.SimpleNamespace(node_namespace=space, node_name=name, topic_type=TWIST) for space, name in names]
+    node = types.SimpleNamespace(
+        resolve_topic_name=lambda topic: f"/{topic}", get_namespace=lambda: "/", get_name=lambda: "bridge_drive",
+        get_publishers_info_by_topic=lambda topic: infos)
+    listener = CommandListener(node, "cmd_vel", "auto", print)
+    assert listener.commanders() == ["/bridge_drive", "/left/bridge_guard", "/planner"]
 
 
 UNNAMED = f"/{UNKNOWN}"

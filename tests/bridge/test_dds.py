@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from ros_graph import commands_per_period
@@ -61,6 +62,22 @@ def test_vehicle_is_stopped_however_the_policy_node_ends(graph, policy, number, 
     assert graph.end("drive", number) == code, graph.log("drive")
     base.wait_until(lambda base: [one[1:] for one in base.commands[-5:]] == [(0.0, 0.0)] * 5)
     assert graph.end("simulate") == 0, graph.log("simulate")
+
+
+def test_second_signal_does_not_cut_the_goodbye_short(graph, policy):
+    """An impatient Ctrl-C, or a terminal and a launcher that both send one: zeros, and no guard left behind."""
+    base = graph.peer("base")
+    base.whole()
+    graph.start("drive", policy)
+    base.wait_until(lambda base: base.moving())
+    pid = graph.processes["drive"].pid
+    (guard,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    since = time.monotonic()
+    graph.processes["drive"].send_signal(signal.SIGINT)
+    base.first_zero(since)
+    assert graph.end("drive", signal.SIGINT) == 0, graph.log("drive")
+    assert not Path(f"/proc/{guard}").exists()
+    assert [one[1:] for one in base.commands[-5:]] == [(0.0, 0.0)] * 5
 
 
 def test_second_commander_makes_the_bridge_stand_and_name_it(graph, policy):

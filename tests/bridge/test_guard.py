@@ -11,6 +11,7 @@ import pytest
 from bridge import ros
 from bridge.commands import CommandTopic, Endpoint
 from bridge.guard import GuardLink, GuardNode, Watchdog, read_beat
+from bridge.vehicle_node import VehicleNode
 
 pytestmark = pytest.mark.quick
 
@@ -35,7 +36,7 @@ def test_guard_sends_zeros_only_after_a_driving_node_fell_silent():
     assert not silence(guard, 0, 100) and not beats(guard, 100, 200)
     guard.command(True)
     sent = silence(guard, 200, 300)
-    assert sent[0] in (210, 211) and len(sent) == 10 and guard.stops == 1 and guard.zeros == 10
+    assert sent[0] in (210, 211) and len(sent) == 10 and guard.stops == 1
 
 
 def test_guard_stops_a_node_that_died_before_its_first_command_was_heard():
@@ -96,7 +97,7 @@ def test_guard_is_ready_when_every_reader_is_matched_the_bases_among_them(matche
     assert guard._ready == ready
 
 
-GOOD = {"topic": "/cmd_vel", "type": "Twist", "ready": True, "zeros": 0, "stops": 0, "hears": ["me"]}
+GOOD = {"guard": "ours", "topic": "/cmd_vel", "type": "Twist", "ready": True, "stops": 0, "hears": ["me"]}
 
 
 @pytest.mark.parametrize("change, problem", [
@@ -111,14 +112,60 @@ def test_bridge_trusts_only_a_guard_that_hears_it_and_reaches_its_base(change, p
     assert link.problem(2.0) == "no guard is running"
 
 
+def test_guard_that_sends_another_type_than_the_base_hears_is_none_and_is_started_again():
+    """A tool that listens in another type had misled it: its zeros would reach the tool alone."""
+    started = []
+
+    def start():
+        process = Process()
+        process.terminate = lambda: setattr(process, "returncode", 0)
+        started.append(process)
+        return process
+
+    link = GuardLink("me", "/cmd_vel", start)
+    link.kind = "TwistStamped"
+    link.keep(0.0)
+    link.heard(1.0, json.dumps({**GOOD, "type": ""}))
+    assert link.problem(1.0) == ""
+    link.heard(1.1, json.dumps(GOOD))
+    assert "no TwistStamped" in link.problem(1.1)
+    link.keep(1.2)
+    assert started[0].returncode == 0 and "ended" in link.problem(1.3)
+    link.keep(2.1)
+    link.heard(2.2, json.dumps({**GOOD, "guard": "second", "type": "TwistStamped"}))
+    assert len(started) == 2 and link.problem(2.2) == "" and started[1].returncode is None
+
+
 def test_guard_of_an_earlier_node_on_the_same_topics_does_not_disturb():
     link = GuardLink("me", "/cmd_vel", None)
+    dead = {**GOOD, "guard": "other", "hears": ["dead"], "ready": False}
     for i in range(20):
-        assert link.heard(1 + i / 20, json.dumps(GOOD))
-        assert not link.heard(1 + i / 20, json.dumps({**GOOD, "hears": ["dead"], "zeros": 10, "stops": 1}))
-        assert link.problem(1 + i / 20) == "" and link.stops == 0
-    link.heard(3.0, json.dumps({**GOOD, "hears": ["dead"]}))
+        assert not link.heard(1 + i / 20, json.dumps(GOOD))
+        assert not link.heard(1 + i / 20, json.dumps({**dead, "stops": i}))
+        assert link.problem(1 + i / 20) == ""
+    link.heard(3.0, json.dumps(dead))
     assert "does not hear" in link.problem(3.0)
+
+
+def test_each_of_two_guards_counts_its_own_stops_and_one_that_serves_is_enough():
+    link = GuardLink("me", "/cmd_vel", None)
+    further = {**GOOD, "guard": "further", "stops": 3, "ready": False}
+    for i in range(20):
+        assert not link.heard(1 + i / 20, json.dumps(GOOD))
+        assert not link.heard(1 + i / 20, json.dumps(further))
+        assert link.problem(1 + i / 20) == ""
+    assert link.heard(2.0, json.dumps({**further, "stops": 4}))
+    assert not link.heard(2.0, json.dumps({**further, "stops": 4}))
+    assert link.heard(2.0, json.dumps({**GOOD, "stops": 1}))
+    link.heard(3.0, json.dumps(further))
+    assert "would not reach" in link.problem(3.0)
+
+
+def test_guard_that_has_forgotten_a_paused_node_meanwhile_still_says_that_it_stopped_it():
+    link = GuardLink("me", "/cmd_vel", None)
+    assert not link.heard(1.0, json.dumps(GOOD))
+    assert link.heard(9.0, json.dumps({**GOOD, "hears": [], "stops": 1}))
+    assert not link.heard(9.0, json.dumps({**GOOD, "hears": [], "stops": 1}))
 
 
 class Process:
@@ -246,3 +293,24 @@ def test_guard_sends_nothing_to_a_new_listener_when_somebody_drives_or_nobody_wa
     guard.command(True)
     guard.new_listener(2.0)
     assert not silence(guard, 200, 300)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_guard_hears_that_a_drive_is_over_only_after_the_zeros(moves):
+    """So that it stops the vehicle where the goodbye is cut short."""
+    said, node = [], VehicleNode.__new__(VehicleNode)
+    node.decider = types.SimpleNamespace(farewell=lambda: moves)
+    node.commands = types.SimpleNamespace(publish_stops=lambda: said.append("zeros"))
+    node.guard = types.SimpleNamespace(session="me", close=lambda: said.append("guard ends"))
+    node._heartbeat = types.SimpleNamespace(publish=lambda beat: said.append(json.loads(beat)["driving"]))
+    node._string, node._lock = (lambda data: data), None
+    node.close()
+    assert said == ["zeros"] * moves + [False, "guard ends"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_further_signal_does_not_disturb_a_goodbye(number):
+    found = signal.getsignal(number)
+    with ros.undisturbed():
+        os.kill(os.getpid(), number)
+    assert signal.getsignal(number) == found

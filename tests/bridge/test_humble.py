@@ -67,7 +67,7 @@ kind = "TwistStamped" if "stamped" in options.image_topic else "Twist"
 node.topics["/whill/controller/cmd_vel"] = f"geometry_msgs/msg/{kind}"
 safety = SafetyConfig((-1.0, -1.0), (1.0, 1.0), hold_zeros=False, require_arm=options.require_arm)
 bridge = drive.DriveNode(node, Controller(Policy(), safety), options)
-beat = {"topic": "/whill/controller/cmd_vel", "type": kind, "ready": True, "zeros": 0, "stops": 0,
+beat = {"guard": "other", "topic": "/whill/controller/cmd_vel", "type": kind, "ready": True, "stops": 0,
         "hears": [bridge.guard.session]}
 """
 DRIVE = START + """

@@ -44,8 +44,8 @@ def test_pulled_emergency_stop_ends_the_drive_until_it_is_released_and_armed(gra
     graph.wait_for("drive", "not armed: emergency stop still holds")
     state["pulled"] = False
     robot.wait_for_status(state="disarmed", holds="[]")
-    robot.arm()
-    robot.wait_for_status(driving=True)
+    robot.drive_again()
+    assert not any("another node" in status["reason"] for status in robot.statuses)
 
 
 def test_collision_that_a_best_effort_sensor_reports_stops_the_drive(graph, policy):

@@ -184,6 +184,13 @@ def test_ros_arguments_are_passed_on():
     assert split_ros_arguments(["a"]) == (["a"], [])
 
 
+def test_option_behind_the_arguments_of_ros_is_heeded():
+    """ROS ends its own at --, as in `ros2 run`; an option --require-arm behind it would count for nothing."""
+    words = ["--ros-args", "-r", "x:=y", "--", "policy", "--require-arm", "--ros-args", "-p", "a:=b"]
+    assert split_ros_arguments(words) == (["policy", "--require-arm"], ["--ros-args", "-r", "x:=y", "-p", "a:=b"])
+    assert split_ros_arguments(["a", "--", "-b"]) == (["a", "--", "-b"], [])
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
 def test_full_disk_ends_the_recording_with_its_cause_and_keeps_what_was_written(tmp_path, capsys):
     writer = TrialWriter(tmp_path, "full")

@@ -188,6 +188,7 @@ def test_scan_shows_the_beam_nearest_to_each_ray(given, rays):
 @pytest.mark.parametrize("given, why", [
     (scan([1, 2, 3]), "the scan looks from -2.36 to 0.79 rad"), (scan([]), "scan of 0 beams"),
     (scan([np.nan] * 4), "without a single valid range"), (scan([1] * 4, angle_increment=0.0), "scan of 4 beams"),
+    (scan([0.0, np.nan, 0.05, 0.0]), "scanner is blind"),  # it is covered or hangs: no wide room
 ])  # fmt: skip
 def test_scan_that_cannot_serve_is_refused(given, why):
     with pytest.raises(SenseError, match=why):

@@ -4,6 +4,8 @@ import time
 
 import pytest
 
+from benchmarks.bridge_robot import message_type
+
 LISTENERS = 3
 """Base, bridge and guard."""
 
@@ -26,6 +28,24 @@ def test_person_who_takes_over_while_driving_is_never_fought_and_the_bridge_need
     assert not [command for command in robot.commands if command[0] > since]  # the WHILL is left to its rider
     person.arm()
     robot.wait_for_status(driving=True)
+
+
+def test_bridge_yields_to_a_person_at_another_source_of_a_mux_and_needs_arming_afterwards(graph, policy):
+    """The mux lets the person's commands pass and then the policy's again, so the bridge itself must have let go."""
+    robot = graph.peer("mux")
+    robot.whole()
+    robot.node.create_subscription(message_type("geometry_msgs/Twist"), "joy/cmd_vel", lambda message: None, 1)
+    graph.start("drive", policy, "--yield-to", "joy/cmd_vel", "nav/cmd_vel_smoothed")
+    person = graph.peer("joystick")
+    publisher, make = person.commander(0.11, "joy/cmd_vel")
+    robot.wait_for_status(driving=True)
+    timer = person.repeat(publisher, 0.05, make)
+    robot.wait_for_status(state="yielded", reason="another node drives")
+    timer.cancel()
+    robot.wait_for_status(state="disarmed", reason="another node drove")
+    since = robot.wait_until_quiet(lambda: len(robot.commands))
+    assert len(robot.commands) == since
+    robot.drive_again()
 
 
 def test_single_stray_command_of_another_node_ends_the_drive(graph, policy):

@@ -1,7 +1,9 @@
 """The robot's own wheel holds all that the robot needs and nothing of the training."""
 
+import ast
 import configparser
 import runpy
+import shlex
 import shutil
 import subprocess
 import sys
@@ -112,12 +114,52 @@ def test_launch_file_names_programs_of_the_package_and_topics_of_the_node(name):
     assert 'package="whill_bridge", executable="bridge_drive"' in text and f'"{ros.COMMAND_TOPIC}"' in text
 
 
-def test_service_starts_again_after_a_crash_and_writes_where_its_user_may():
+def test_policy_behind_a_mux_yields_to_each_source_that_goes_before_it():
+    yaml = pytest.importorskip("yaml")
+    mux = yaml.safe_load((ROOT / "bridge" / "config" / "twist_mux.yaml").read_text(encoding="utf-8"))
+    sources = mux["twist_mux"]["ros__parameters"]["topics"]
+    before = [one["topic"] for one in sources.values() if one["priority"] > sources["policy"]["priority"]]
+    text = (ROOT / "bridge" / "launch" / "twist_mux.launch.py").read_text(encoding="utf-8")
+    given = [ast.literal_eval(node) for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Dict)]
+    (yields,) = [one["yield_to"] for one in given if "yield_to" in one]
+    assert sorted(yields) == sorted(before)
+
+
+def service_unit():
+    """The section of the service unit."""
     unit = configparser.ConfigParser(strict=False, interpolation=None)
     unit.optionxform = str
     unit.read(ROOT / "bridge" / "systemd" / "whill-bridge.service")
-    service = unit["Service"]
-    assert service["Restart"] == "always"  # `ros2 launch` ends with 0 when a node of it has died
+    return unit["Service"]
+
+
+def test_service_stops_the_node_itself_in_order_and_leaves_the_guard_to_stop_a_dead_ones_vehicle():
+    unit = service_unit()
+    command = shlex.split(unit["ExecStart"])[-1]
+    assert "ros2 launch" not in command and "ros2 run" not in command  # they leave SIGINT to the terminal
+    assert command.rpartition("; ")[2].startswith('exec "$at/lib/whill_bridge/bridge_drive" ')
+    assert unit["KillSignal"] == "SIGINT" and unit["KillMode"] == "process"  # mixed kills the guard with the node
+
+
+def test_service_starts_the_node_with_the_parameters_of_the_package():
+    pytest.importorskip("yaml")
+    from bridge.drive import parse_arguments
+    from bridge.parameters import with_options
+    from bridge.ros import split_ros_arguments
+
+    config = configparser.ConfigParser()
+    config.read(ROOT / "bridge" / "setup.cfg")
+    assert config["develop"]["script_dir"] == config["install"]["install_scripts"] == "$base/lib/whill_bridge"
+    line = shlex.split(service_unit()["ExecStart"])[-1].rpartition("; ")[2].removeprefix("exec ")
+    program, *words = shlex.split(line.replace("$at/share/whill_bridge", str(ROOT / "bridge")))
+    own, of_ros = split_ros_arguments(words)
+    options = parse_arguments(with_options(of_ros, "bridge_drive", "policy", own))
+    assert options.policy == "/opt/whill/policy" and options.require_arm
+
+
+def test_service_starts_again_after_a_crash_and_writes_where_its_user_may():
+    service = service_unit()
+    assert service["Restart"] == "always"
     assert not [value for value in service.values() if "%h" in value]  # the home of root, whatever User says
 
 
