@@ -1,13 +1,8 @@
-"""What these very drives can show: how often they raise a false alarm, how surely an effect is noticed, and
-what a p-value of the search comes to where nothing is missing.
+"""What these very drives can show, on simulated days: false alarms, power, and what a p-value of the search comes to.
 
-Days with nothing missing are simulated as the nulls of the scan are, but drawn anew; an effect adds its columns.
-Linear, like the scan: `--refit-nulls` measures the false alarms of the whole procedure.
-
-The p-value of the search assumes that drives differ from the reference days as these do from each other. Real days do
-so only roughly: small values come too often, and those that a refit takes back end at 1. On logs of an independent
-plant with nothing in them they follow a Beta distribution (`benchmarks.undeclared --calibrate` fits it), whose
-distribution function makes them uniform there. It decides nothing: verdicts go by the p-values of the search.
+Linear, like the scan: `--refit-nulls` measures the false alarms of the whole procedure. Real days differ only roughly
+as the reference days do, so small p-values come too often. On logs of an independent plant with nothing in them they
+follow a Beta distribution (`benchmarks.undeclared --calibrate`), which `calibrated` takes off. It decides nothing.
 """
 
 from __future__ import annotations

@@ -137,9 +137,7 @@ def sentence(proposal: Mapping[str, Any]) -> str:
 
 def command_of(proposal: Mapping[str, Any]) -> Command:
     """The commands of a proposal."""
-    parameters = proposal["parameters"]
-    return make_command(proposal["name"], parameters["v"], parameters["omega"], parameters["seconds"],
-                        parameters["dt"])
+    return make_command(proposal["name"], **proposal["parameters"])
 
 
 def describe_unnamed(one: Mapping[str, Any]) -> str:

@@ -21,13 +21,11 @@ from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
 from sysid.verdict.found import NullRefits, PairScan, Search, tail
-from sysid.verdict.pairs import scan_again
 from sysid.verdict.posterior import Thresholds, posterior
 from sysid.verdict.rounds import Asked
-from sysid.verdict.scan import best, drawn_away
+from sysid.verdict.scan import best, drawn_away, scan_again
 
-TOGETHER, ACCELERATED = 16, 100
-"""Days whose base fits advance side by side on a processor, and on an accelerator."""
+TOGETHER, ACCELERATED = 16, 100  # days whose base fits advance side by side on a processor, and on an accelerator
 
 
 def run(

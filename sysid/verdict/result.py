@@ -34,8 +34,7 @@ class Support:
     errors: np.ndarray  # (G,) their standard errors
     agreement: Heterogeneity
     foretold: np.ndarray  # (G,) squared residual that the others' fit saves each manoeuvre
-    interval: tuple[float, float]
-    """95 % of the sum of it, manoeuvres drawn anew."""
+    interval: tuple[float, float]  # 95 % of the sum of it, manoeuvres drawn anew
     falsifiers: tuple[Tested, ...]
 
     def against(self, thresholds: Thresholds) -> list[str]:
@@ -101,13 +100,11 @@ class Prepared:
     reference: Reference
     plant: Plant
     hypotheses: tuple[Hypothesis, ...]
-    full: Any
-    """The vehicle with the whole catalogue at neutral."""
+    full: Any  # the vehicle with the whole catalogue at neutral
     names: tuple[str, ...]
     paths: PathReplay
     wander: Wander
-    others: dict[Any, PathReplay] = field(default_factory=dict)
-    """Compiled replays of vehicles with effects that the catalogue does not have, by plant and structure."""
+    others: dict[Any, PathReplay] = field(default_factory=dict)  # compiled replays of vehicles with other effects
 
     @property
     def vehicle(self) -> FreeVehicle:
@@ -151,34 +148,26 @@ class Result:
     evidence: Evidence
     seconds: dict[str, float]
     null_refits: NullRefits | None = None
-    stood: tuple[Support, ...] = ()
-    """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
-    noise: NoiseLevels | None = None
-    """Noise of each channel over that of the reference days; None without such days."""
-    floor: FloorChange | None = None
-    """Whether the floor is another than on the reference days; None where nothing could show it."""
+    stood: tuple[Support, ...] = ()  # for and against each effect of the final fit, where one was about to be named
+    noise: NoiseLevels | None = None  # noise of each channel over that of the reference days; None without such days
+    floor: FloorChange | None = None  # beside that of the reference days; None where nothing could show it
 
     @property
     def reference(self) -> Reference:
-        """The vehicle as it was."""
         return self.prepared.reference
 
     @property
     def plant(self) -> Plant:
-        """What replays it."""
         return self.prepared.plant
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """What was tried."""
         return self.prepared.hypotheses
 
     @property
     def full(self) -> Any:
-        """The vehicle with the whole catalogue at neutral."""
         return self.prepared.full
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Its parameters."""
         return self.prepared.names

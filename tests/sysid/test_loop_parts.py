@@ -17,16 +17,16 @@ from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
-from sysid.pages.loop_evidence import in_range
 from sysid.pages.loop_page import not_determined
+from sysid.pages.loop_tables import in_range
 from sysid.pages.verdict_picture import account, draw
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import foretold
-from sysid.verdict.classes import imitation
 from sysid.verdict.found import Scan
 from sysid.verdict.posterior import Findings, Left, Thresholds, TriedSet, posterior, read, write
 from sysid.verdict.rounds import Asked
+from sysid.verdict.scan import imitation
 from whill_mjx.effects import about_of
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.presets import preset
