@@ -53,15 +53,13 @@ def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[
 
 def choose(series: Sequence[TrialSeries]) -> list[TrialSeries]:
     """At most MAX_TRIALS, held-out ones first, each manoeuvre before its repetitions."""
-    order = sorted(range(len(series)), key=lambda i: (not series[i].held_out, _repetition(series[i].name), i))
-    held_out = [i for i in order if series[i].held_out][: MAX_TRIALS // 2 + 2]
-    rest = [i for i in order if not series[i].held_out]
-    return [series[i] for i in held_out + rest[: MAX_TRIALS - len(held_out)]]
+    def repetition(trial: TrialSeries) -> int:
+        tail = trial.name.rsplit("_", 1)[-1]
+        return int(tail) if tail.isdigit() else 0
 
-
-def _repetition(name: str) -> int:
-    tail = name.rsplit("_", 1)[-1]
-    return int(tail) if tail.isdigit() else 0
+    order = sorted(series, key=repetition)
+    held_out = [trial for trial in order if trial.held_out][: MAX_TRIALS // 2 + 2]
+    return held_out + [trial for trial in order if not trial.held_out][: MAX_TRIALS - len(held_out)]
 
 
 def summary(report: dict[str, Any], series: Sequence[TrialSeries]) -> str:
