@@ -12,7 +12,7 @@ from sysid.errors.noise import fit_roughness, fit_whitener
 from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.missing.days import Wander
 from sysid.missing.drives import DRAIN, SESSION, Drives
-from sysid.missing.evidence import Columns
+from sysid.missing.evidence import Columns, column_layout
 from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
@@ -282,9 +282,9 @@ def test_what_only_acts_through_another_axis_has_a_column_of_that_alone():
     def simulate(sets):
         return (sets[:, 0] * (1 + sets[:, 1]))[:, None, None, None]
 
-    columns, listed = signature_columns(SimpleNamespace(simulate=simulate), [one], np.zeros(2), ["some.a", "some.b"],
-                                        np.zeros((1, 1, 1)))
-    [at] = [columns[0, 0, 0, list(each.index)] for each in listed if each.level == 2.0]
+    columns = signature_columns(SimpleNamespace(simulate=simulate), [one], np.zeros(2), ["some.a", "some.b"],
+                                np.zeros((1, 1, 1)))
+    [at] = [columns[0, 0, 0, list(each.index)] for each in column_layout([one], 0) if each.level == 2.0]
     np.testing.assert_allclose(at, [1.0, 2.0])
 
 
