@@ -20,8 +20,8 @@ from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander
 from sysid.missing.evidence import Columns, Evidence, Solver
-from sysid.verdict.found import Scan, family, tail
-from sysid.verdict.scan import NullDays, look
+from sysid.verdict.found import Scan, family, tails
+from sysid.verdict.scan import NullDays, worth_on
 
 DRAWS = 200
 SEED = 3  # beside that of the scan's nulls
@@ -49,13 +49,10 @@ class Days:
         added = np.stack([products[:, list(columns.index)] @ q for columns, q in effects]) if effects else np.zeros(
             (1, len(products)))
         moments = (added[:, None] + self.nulls.moments).reshape(-1, len(products))
-        solver, worth = Solver(self.evidence), np.zeros((len(moments), len(self.hypotheses)))
-        for number, (one, covariance) in enumerate(zip(self.evidence.columns, self.wander.covariance, strict=True)):
-            away = np.tile(self.wander.away(number, self.nulls.share), (len(added), 1))
-            found = look(solver, one, self.hypotheses[one.hypothesis].axes, covariance, moments, away)
-            worth[:, one.hypothesis] = np.maximum(worth[:, one.hypothesis], found.worth)
-        each = np.stack([tail(self.scan.null[:, h], worth[:, h]) for h in range(len(self.hypotheses))], axis=-1)
-        return np.array([family(self.scan.smallest, float(one)) for one in each.min(1)]).reshape(-1, draws)
+        days = NullDays(moments, np.tile(self.nulls.share, (len(added), 1)))
+        worth = worth_on(days, Solver(self.evidence), self.hypotheses, self.wander)
+        smallest = tails(self.scan.null, worth).min(1)
+        return np.array([family(self.scan.smallest, float(one)) for one in smallest]).reshape(-1, draws)
 
     def noticed(self, alpha: float, effects: Sequence[Effect]) -> list[float]:
         """Of each effect the share of days on which something counts as missing."""

@@ -96,6 +96,12 @@ def tail(null: np.ndarray, value: np.ndarray | float, least: float = 1e-9) -> np
     return np.asarray(np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), empirical))
 
 
+def tails(null: np.ndarray, values: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """(..., H) `tail` of values (..., H), each of its own draws (N, H)."""
+    each = [tail(null[:, h], values[..., h], least) for h in range(null.shape[1])]
+    return np.moveaxis(np.array(each).reshape(-1, *values.shape[:-1]), 0, -1)
+
+
 def family(smallest: np.ndarray, p: float) -> float:
     """p-value of the smallest p among dependent tests, from its null sample; extrapolated as p x effective number."""
     count = len(smallest)

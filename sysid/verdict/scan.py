@@ -15,8 +15,8 @@ import numpy as np
 
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import Wander
-from sysid.missing.evidence import RIDGE, Columns, Evidence, Solver
-from sysid.verdict.found import PairScan, Scan, tail
+from sysid.missing.evidence import Columns, Evidence, Solver
+from sysid.verdict.found import PairScan, Scan, tails
 
 REACH = 1.6  # how far beyond a level its columns are trusted, as a factor on the level
 SPREAD_FREEDOM = 8  # degrees of freedom that the day-to-day spread rests on
@@ -105,14 +105,18 @@ def run(
     solver = Solver(evidence)
     gain, worth, q = best(solver, hypotheses, wander)
     days = null_days(evidence, spread, wander, draws, rng)
-    null = np.zeros((draws, len(hypotheses)))
-    for number, (columns, covariance) in enumerate(zip(evidence.columns, wander.covariance, strict=True)):
+    null = worth_on(days, solver, hypotheses, wander)
+    return Scan(gain, worth, q, null, tails(null, worth), tails(null, null).min(1))
+
+
+def worth_on(days: NullDays, solver: Solver, hypotheses: Sequence[Hypothesis], wander: Wander) -> np.ndarray:
+    """(N, H) worth of each hypothesis on simulated days, at the level of its highest."""
+    worth = np.zeros((len(days.moments), len(hypotheses)))
+    for number, (columns, covariance) in enumerate(zip(solver.evidence.columns, wander.covariance, strict=True)):
         away = wander.away(number, days.share)
         found = look(solver, columns, hypotheses[columns.hypothesis].axes, covariance, days.moments, away)
-        null[:, columns.hypothesis] = np.maximum(null[:, columns.hypothesis], found.worth)
-    p = np.array([tail(null[:, h], worth[h]) for h in range(len(hypotheses))])
-    each = np.stack([tail(null[:, h], null[:, h]) for h in range(len(hypotheses))], axis=-1)
-    return Scan(gain, worth, q, null, p, each.min(1))
+        worth[:, columns.hypothesis] = np.maximum(worth[:, columns.hypothesis], found.worth)
+    return worth
 
 
 @dataclass(frozen=True)
@@ -200,11 +204,9 @@ class PairSolver:
 
     def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander, nulls: NullDays):
         solver, self.size = Solver(evidence), evidence.base_size
-        size = self.size
-        self.left = solver.products[size:, size:] - solver.products[:size, size:].T @ solver.project[:, size:]
-        self.left[np.diag_indices(len(self.left))] += RIDGE * np.maximum(np.diag(solver.products)[size:], 1e-12)
-        every = np.concatenate([solver.moments[None], nulls.moments])
-        self.score = every[:, size:] - every[:, :size] @ solver.project[:, size:]  # (1 + N, S)
+        index = range(self.size, len(solver.products))
+        self.left = solver.information(index)
+        self.score = solver.score(index, np.concatenate([solver.moments[None], nulls.moments]))  # (1 + N, S)
         self.columns, self.wander = evidence.columns, wander.covariance
         away = [wander.away(number, nulls.share) for number in range(len(wander.shapes))]
         self.away = [np.concatenate([np.zeros((1, one.shape[1])), one]) for one in away]  # the drives' own is 0
@@ -243,19 +245,15 @@ def scan_pairs(
     members = tuple((i, j) for i, j in combinations(range(len(hypotheses)), 2)
                     if hypotheses[i].effect != hypotheses[j].effect and max(similar[i, j], similar[j, i]) <= alike)
     gain, worth, found, null = _looked(PairSolver(evidence, hypotheses, wander, nulls), hypotheses, members)
-    p, smallest = np.ones(len(members)), np.ones(len(null))
-    for m in range(len(members)):
-        p[m] = float(tail(null[:, m], worth[m], CHI_SQUARED))
-        smallest = np.minimum(smallest, tail(null[:, m], null[:, m], CHI_SQUARED))
-    return PairScan(members, gain, worth, found, p, smallest, null)
+    smallest = tails(null, null, CHI_SQUARED).min(1, initial=1.0)
+    return PairScan(members, gain, worth, found, tails(null, worth, CHI_SQUARED), smallest, null)
 
 
 def scan_again(first: PairScan, evidence: Evidence, hypotheses: Sequence[Hypothesis], wander: Wander) -> PairScan:
     """The same pairs on other drives of the same commands, held against the nulls of a scan made before."""
     nothing = NullDays(np.zeros((0, evidence.products.shape[1])), np.zeros((0, len(wander.shapes[0]))))
     gain, worth, found, _ = _looked(PairSolver(evidence, hypotheses, wander, nothing), hypotheses, first.members)
-    p = np.array([float(tail(first.null[:, m], worth[m], CHI_SQUARED)) for m in range(len(first.members))])
-    return replace(first, gain=gain, worth=worth, q=found, p=p)
+    return replace(first, gain=gain, worth=worth, q=found, p=tails(first.null, worth, CHI_SQUARED))
 
 
 def _looked(
