@@ -15,11 +15,10 @@ from sysid.missing.catalogue import base_values
 from sysid.missing.evidence import Evidence, Solver, at_fit
 from sysid.missing.signatures import group_names
 from sysid.replay.rollout import predictions
-from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import as_report as predictions_of
 from sysid.verdict.forms import forms_of
 from sysid.verdict.found import ROUNDS
-from sysid.verdict.result import Result
+from sysid.verdict.result import Result, Support
 from sysid.verdict.scan import null_days
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before, refitter_of
 from whill_mjx.effects import about_of
@@ -88,20 +87,17 @@ def in_range(parameter: str, value: float, ends: Sequence[float]) -> dict[str, A
 
 def evidence_for(result: Result, part: slice, effect: str) -> dict[str, Any]:
     """What manoeuvres say of an effect by themselves, whether it predicts those left out, and its falsifiers."""
-    one = next((one for one in result.stood if one.effect == effect), None)
-    final, groups, precision = result.search.final, result.evidence.groups, result.evidence.precision
-    sizes, errors = (one.sizes, one.errors) if one else sizes_apart(final, part, groups, precision)
-    left_out = one.foretold if one else foretold(final, part, groups, precision)
-    agreement = heterogeneity(sizes, errors)
-    names = group_names(result.log.training, groups)
-    return {"left_out_gain": dict(zip(names, left_out.tolist(), strict=True)), "left_out_total": float(left_out.sum()),
-            "left_out_interval": list(interval_of_sum(left_out)),
+    one = next((one for one in result.stood if one.effect == effect), None) or Support.of(
+        result.search.final, part, result.evidence.groups, result.evidence.precision, effect)
+    agreement, names = one.agreement, group_names(result.log.training, result.evidence.groups)
+    each = zip(names, one.sizes, one.errors, agreement.asked, strict=True)
+    return {"left_out_gain": dict(zip(names, one.foretold.tolist(), strict=True)),
+            "left_out_total": float(one.foretold.sum()), "left_out_interval": list(one.interval),
             "by_manoeuvre": [{"manoeuvre": name, "factor": float(size), "standard_error": float(error),
-                              "asked": bool(asked)}
-                             for name, size, error, asked in zip(names, sizes, errors, agreement.asked, strict=True)],
+                              "asked": bool(asked)} for name, size, error, asked in each],
             "heterogeneity": {"q": agreement.q, "manoeuvres": int(agreement.asked.sum()), "p_value": agreement.p,
                               "scatter": agreement.scatter, "power": agreement.power, "outcome": agreement.outcome},
-            "falsifiers": predictions_of(one.falsifiers) if one else []}
+            "falsifiers": predictions_of(one.falsifiers)}
 
 
 def form_curves(result: Result) -> dict[str, list[dict[str, Any]]]:

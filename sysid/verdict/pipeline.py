@@ -22,7 +22,6 @@ from sysid.missing.refit import Refitter
 from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
-from sysid.verdict.agreement import foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.alone import search_alone, stands_alone
 from sysid.verdict.falsification import put_to_test
 from sysid.verdict.found import PairScan, Search
@@ -164,14 +163,10 @@ def stand(
     p_excess: Callable[[float], float],
 ) -> list[Support]:
     """The evidence for each effect of the final fit, in its order."""
-    fit, out = found.final, []
+    fit = found.final
     tested = put_to_test(fit, refitter, trials, groups, track, p_excess)
-    for number, (one, part) in enumerate(zip(fit.hypotheses, fit.parts, strict=True)):
-        sizes, errors = sizes_apart(fit, part, groups, refitter.precision)
-        gains = foretold(fit, part, groups, refitter.precision)
-        out.append(Support(one.effect, sizes, errors, heterogeneity(sizes, errors), gains, interval_of_sum(gains),
-                         tuple(tested[number])))
-    return out
+    return [Support.of(fit, part, groups, refitter.precision, one.effect, tuple(mine))
+            for one, part, mine in zip(fit.hypotheses, fit.parts, tested, strict=True)]
 
 
 def guarded(found: Search, stood: Sequence[Support], thresholds: Thresholds) -> Search:

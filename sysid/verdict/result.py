@@ -16,9 +16,10 @@ from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.days import Reference, Wander
 from sysid.missing.drives import Drives, make_drives
 from sysid.missing.evidence import Evidence, column_layout
+from sysid.missing.joint_fit import Refit
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay
-from sysid.verdict.agreement import Heterogeneity
+from sysid.verdict.agreement import Heterogeneity, foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import Tested, in_words
 from sysid.verdict.found import NullRefits, Search
 from sysid.verdict.posterior import Thresholds
@@ -36,6 +37,14 @@ class Support:
     foretold: np.ndarray  # (G,) squared residual that the others' fit saves each manoeuvre
     interval: tuple[float, float]  # 95 % of the sum of it, manoeuvres drawn anew
     falsifiers: tuple[Tested, ...]
+
+    @classmethod
+    def of(cls, fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray, effect: str,
+           falsifiers: tuple[Tested, ...] = ()) -> Support:
+        """That of an effect whose coordinates are `part` of q; `groups`: trials of each manoeuvre."""
+        sizes, errors = sizes_apart(fit, part, groups, precision)
+        gains = foretold(fit, part, groups, precision)
+        return cls(effect, sizes, errors, heterogeneity(sizes, errors), gains, interval_of_sum(gains), falsifiers)
 
     def against(self, thresholds: Thresholds) -> list[str]:
         """What contradicts the effect, in words."""

@@ -159,7 +159,7 @@ def _without_stand_ins(asked: Asked, one: Weighed) -> list[Weighed]:
     final, out = one.members[-1].refit, []
     for number in range(len(one.members) - 1):
         place = final.hypotheses.index(one.members[number].hypothesis)
-        q = np.concatenate([part for i, part in enumerate(final.split) if i != place])
+        q = np.delete(final.q, final.parts[place])
         kept = (*final.hypotheses[:place], *final.hypotheses[place + 1 :])
         [without] = asked.refitter.fit_all([Start(kept, final.u, q)], POLISH)
         members = tuple(each for i, each in enumerate(one.members) if i != number)
