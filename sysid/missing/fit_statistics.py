@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors.features import CHANNELS, GYRO, bin_width, channel_names, make_features
+from sysid.errors.features import CHANNELS, GYRO, Features, bin_width, channel_names, make_features
 from sysid.errors.noise import ROUGH, Whitener, courses_of, fit_roughness, fit_whitener, roughness, scatter
 from sysid.logs.records import Prediction, Trial
 from sysid.replay.records import Measured
@@ -87,18 +87,19 @@ def statistics_of(
 ) -> FitStatistics:
     """Those of a fit of the parameters `names`: `seen` are the trials as the fitted vehicle replays them, `error` (P,)
     standard errors in their own units, `covariance` (P, P) in unit coordinates."""
-    size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-    return FitStatistics(tuple(names), error, np.clip(covariance / np.outer(size, size), -1.0, 1.0),
-                         leftovers_of(tuple(trials), seen, track))
-
-
-def leftovers_of(trials: tuple[Trial, ...], seen: Sequence[Prediction], track: float) -> Leftovers:
-    """What replays leave of trials."""
-    features = make_features(trials, bin_width(trials))
+    features, size = make_features(tuple(trials), bin_width(trials)), np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     target, at = (features.of(_table(each)) for each in (trials, seen))
-    factors = fit_roughness(target - at, features.mask, roughness(at, features.width, track))
-    mask = features.mask / factors[roughness(at, features.width, track)]
-    return leftovers_in_bins(trials, target - at, mask, features.width, factors)
+    return FitStatistics(tuple(names), error, np.clip(covariance / np.outer(size, size), -1.0, 1.0),
+                         leftovers_of(tuple(trials), target, at, features, track))
+
+
+def leftovers_of(
+    trials: tuple[Trial, ...], target: np.ndarray, at: np.ndarray, features: Features, track: float
+) -> Leftovers:
+    """What replays of trials, as features `at` (B, K, C), leave of the measured ones, `target`."""
+    level = roughness(at, features.width, track)
+    factors = fit_roughness(target - at, features.mask, level)
+    return leftovers_in_bins(trials, target - at, features.mask / factors[level], features.width, factors)
 
 
 def leftovers_in_bins(

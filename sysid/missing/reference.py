@@ -25,7 +25,7 @@ from sysid.errors.space import Space, make_space
 from sysid.logs.records import Log, Trial
 from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
 from sysid.missing.drives import Drives, make_drives
-from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_in_bins
+from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_of
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try
 from sysid.search.result import Progress
@@ -144,10 +144,7 @@ def _own_leftovers(drives: Drives, space: Space, u: np.ndarray, log: Log, progre
     prior = (u, np.diag(1 / (3 * spread) ** 2))
     own = BaseFit(drives, space, whitener, difference_sizes(np.diag(spread**2))).run(u, OWN_ITERATIONS, prior, progress)
     at = drives.simulate(space.to_values(own)[None])[0]
-    level = roughness(at, drives.features.width, log.spec.track)
-    factors = fit_roughness(drives.target - at, drives.mask, level)
-    return leftovers_in_bins(log.training, drives.target - at, drives.mask / factors[level], drives.features.width,
-                             factors)
+    return leftovers_of(log.training, drives.target, at, drives.features, log.spec.track)
 
 
 def _drawn(trials: tuple[Trial, ...], mask: np.ndarray, left: Leftovers) -> tuple[Leftover, ...]:

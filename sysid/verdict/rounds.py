@@ -59,10 +59,6 @@ class Asked:
         """Squared white residual (B, n) over its number of values, less 1."""
         return float(np.square(residual).sum()) / self.count - 1
 
-    def p_left(self, residual: np.ndarray) -> float:
-        """Probability of so much excess on a day with nothing missing."""
-        return self.wander.p_excess(self.excess(residual))
-
     def explained(self, fit: Refit) -> float:
         """Share of the base fit's excess that a fit removes; where there is hardly any, of what a day's varies by."""
         before = self.excess(self.base.residual)

@@ -79,7 +79,7 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
         able = [one for one in new if findings.able(one.numbers, asked.thresholds)]
         if len(members) == 2:
             out += [each for one in new[:1] for each in _without_stand_ins(asked, one)]
-        if not able or (asked.p_left(able[0].members[-1].refit.residual) >= asked.thresholds.alpha
+        if not able or (asked.wander.p_excess(able[0].numbers.left.excess) >= asked.thresholds.alpha
                         and not more_stands_out(asked, able[0])):
             break
         members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
@@ -94,7 +94,7 @@ def _in_their_place(asked: Asked, found: Search, findings: Findings, weighed: Se
     able = [one for one in weighed if findings.able(one.numbers, asked.thresholds)]
     pairs = [one for one in able if len(one.members) == 2]
     best = max(pairs, key=lambda one: one.numbers.gain, default=None)
-    if best is None or asked.p_left(best.members[-1].refit.residual) >= asked.thresholds.alpha:
+    if best is None or asked.wander.p_excess(best.numbers.left.excess) >= asked.thresholds.alpha:
         return list(weighed)
     starts = [one.members[0] for one in [one for one in able if len(one.members) == 1][1:2]]
     last = best.members[-1]
