@@ -259,14 +259,12 @@ def _own_columns(refitter: Refitter, drives: Drives, fit: Refit, at: np.ndarray)
 
 def _held(result: Result, fit: Refit) -> np.ndarray:
     """(P + k, P + k) precision of a rival on a new day: base by the spread, coordinates by drives and wander."""
-    size = len(fit.u)
-    flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
-    matrix = flat.T @ flat
-    inside = matrix[:size, :size] + result.evidence.precision
+    size, precision = len(fit.u), result.evidence.precision
+    matrix = fit.products(precision)
     cross = matrix[:size, size:]
     out = np.zeros_like(matrix)
-    out[:size, :size] = result.evidence.precision
-    separable = matrix[size:, size:] - cross.T @ np.linalg.solve(inside, cross)
+    out[:size, :size] = precision
+    separable = matrix[size:, size:] - cross.T @ np.linalg.solve(matrix[:size, :size], cross)
     covariance = np.linalg.inv(separable + 1e-9 * np.eye(len(separable)))
     for one, part in zip(fit.hypotheses, fit.parts, strict=True):
         covariance[part, part] += result.prepared.wander.at(
