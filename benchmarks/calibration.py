@@ -100,11 +100,8 @@ def small(config: Benchmark) -> dict[str, dict]:
         log = load_log(folder / "log")
         settings = FitConfig(model=str(write(folder / f"robot.{suffix}", chair)), quick=config.quick,
                              elsewhere=config.elsewhere)
-        progress, close = progress_bar(expected_steps(settings))
-        try:
+        with progress_bar(expected_steps(settings)) as progress:
             fit = fit_log(log, settings, progress)
-        finally:
-            close()
         rows = error_rows(log.trials, *predict(fit, log.trials))
     one = summaries(rows, log.trials)["summary"]["held_out"]["ground_truth"]["trajectory"]
     found = dict(zip(fit.space.names, fit.space.to_values(fit.u), strict=True))
@@ -167,11 +164,8 @@ def skids(config: Benchmark) -> dict[str, dict]:
             settings = FitConfig(model=str(write_skid_urdf(folder / "robot.urdf", robot)), quick=config.quick,
                                  elsewhere=config.elsewhere)
             log = load_log(folder / "log")
-            progress, close = progress_bar(expected_steps(settings))
-            try:
+            with progress_bar(expected_steps(settings)) as progress:
                 fit = fit_log(log, settings, progress)
-            finally:
-                close()
         before, after = predict(fit, log.trials)
         one = summaries(error_rows(log.trials, before, after), log.trials)["summary"]["held_out"]["ground_truth"]
         found = dict(zip(fit.space.names, fit.space.to_values(fit.u), strict=True))

@@ -20,7 +20,7 @@ from sysid.errors.bin_objective import make_features_objective
 from sysid.errors.pose_objective import HUGE, Objective
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
-from sysid.search import least_squares, starts, tpe
+from sysid.search import least_squares, starts, studies
 from sysid.search.comparison import Effort, Judge, arrivals, trace
 from sysid.search.fitting import Problem, choose
 from sysid.search.result import Stages, Trace
@@ -139,7 +139,8 @@ def tpe_batched(problem: Problem, evaluations: int, seed: int, kept: Path) -> di
     objective, space = problem.objective, problem.space
     objective.paper_cost(np.tile(space.to_unit(space.initial), (BATCH["tpe"], 1)))
     costs: Any = RememberedCosts(objective, kept)
-    found = tpe.fit(costs, space, tpe.GlobalSearch(evaluations, seed, "paper"), progress=reporter(kept.stem))
+    search = studies.GlobalSearch(evaluations, seed, "paper")
+    found = studies.global_search(costs, space, search, progress=reporter(kept.stem))
     return {"cost": found.cost, "seconds": costs.seconds}
 
 

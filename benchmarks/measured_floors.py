@@ -25,15 +25,15 @@ from sysid.missing.catalogue import PARAMETER, base_values
 from sysid.missing.days import no_wander
 from sysid.missing.drives import make_drives
 from sysid.missing.fit_statistics import FittedVehicle
-from sysid.pages.loop_errors import replay
+from sysid.pages.loop_tables import replay
 from sysid.replay.models import with_effects
 from sysid.replay.records import FreeVehicle
 from sysid.replay.rollout import vehicle_plant
-from sysid.verdict.floor import floor_change
 from sysid.verdict.late_pose import yaw_rates
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.preparation import reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result
+from sysid.verdict.surroundings import floor_change
 from sysid.verdict.vehicles import on_other_floor
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values

@@ -76,7 +76,7 @@ def make_bench(log: Log, physics_dt: float, iterations: int) -> Bench:
                                lambda _, text: print(f"  {text}", flush=True))
     names = tuple(base_values(full))
     training = make_drives(FreeVehicle(plant, full, names), log.training, reference.width)
-    held_out = training.of(log.held_out, plant.dt)
+    held_out = training.of(log.held_out)
     return Bench(log, reference.params, base, training, held_out)
 
 

@@ -19,9 +19,8 @@ from sysid.logs.published.drive_norlab import load_drive
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.logs.unusable import without_lost
 from sysid.missing.catalogue import PARAMETER
-from sysid.pages.loop_errors import replay
-from sysid.pages.loop_evidence import base_table
 from sysid.pages.loop_report import effects
+from sysid.pages.loop_tables import base_table, replay
 from sysid.verdict.late_pose import NAME
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.result import LoopConfig, Result

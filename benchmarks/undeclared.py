@@ -213,7 +213,7 @@ def look_alikes(settings: Benchmark) -> None:
     from sysid.missing.drives import make_drives
     from sysid.missing.signatures import gather
     from sysid.replay.records import FreeVehicle
-    from sysid.verdict.classes import imitation
+    from sysid.verdict.scan import imitation
 
     days = reference_days(settings.work / "plant")
     content: dict[str, Any] = {"threshold": 0.9, "command": "python -m benchmarks.undeclared --classes", "sensors": {}}

@@ -39,7 +39,6 @@ from sysid.verdict.result import LoopConfig
 
 KIND = "sysid.close_loop"
 OUTPUTS = ("next_command.csv", "method.html", "evidence.json", "steps")
-STOPPED = "stopped; give the same command again to go on."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +115,7 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
 
 def cli() -> None:
     """Command line."""
-    command_line.run(Arguments, main, __doc__, stopped=STOPPED)
+    command_line.run(Arguments, main, __doc__, stopped=command_line.STOPPED)
 
 
 if __name__ == "__main__":

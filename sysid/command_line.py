@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from sysid.replay.model_files import steps_mjx
 from sysid.search.result import Progress
 from whill_mjx.io import command_line
 from whill_mjx.io.heartbeat import Heartbeat
+
+STOPPED = "stopped; give the same command again to go on."
 
 
 class OwnModels:
@@ -25,8 +27,7 @@ class OwnModels:
         return not steps_mjx(self.model, self.wheels, self.parameters)
 
 
-_heartbeats: list[Heartbeat] = []
-"""That of the command which runs in this process; none where the package is used from Python."""
+_heartbeats: list[Heartbeat] = []  # of the command in this process; none where the package is used from Python
 
 
 def run(options: type, main: Callable[[Any], Any], description: str | None, **more: Any) -> None:
@@ -49,8 +50,9 @@ def stage(text: str) -> None:
         heartbeat.stage(text)
 
 
-def progress_bar(total: int, what: str = "fit") -> tuple[Progress, Callable[[], None]]:
-    """A line with elapsed and remaining time and a remark, and the function that closes it."""
+@contextmanager
+def progress_bar(total: int, what: str = "fit") -> Iterator[Progress]:
+    """A line with elapsed and remaining time and a remark."""
     from tqdm import tqdm
 
     form = "{desc} {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"  # a stage and its cost fit into 80 columns
@@ -60,10 +62,9 @@ def progress_bar(total: int, what: str = "fit") -> tuple[Progress, Callable[[], 
         bar.set_postfix_str(remark, refresh=count == 0)
         bar.update(min(count, max(bar.total - bar.n, 0)))
 
-    def close() -> None:
-        if sys.exc_info()[0] is None and bar.n:  # the total is the most that there may be to do
-            bar.total = bar.n
+    try:
+        yield advance
+        bar.total = bar.n or total  # the total is the most that there may be to do
+    finally:
         bar.close()
-
-    return advance, close
 

@@ -55,7 +55,8 @@ def to_lerobot(config: ConvertConfig) -> Log:
         check_place("--out", config.out)
         if config.out.exists():
             raise FolderRefused(f"--out {config.out}: exists already. Choose another place.")
-        with TemporaryDirectory(prefix=f".{config.out.name}.", dir=_made(config.out.parent)) as partial:
+        config.out.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=f".{config.out.name}.", dir=config.out.parent) as partial:
             made = Path(partial) / config.out.name
             notes = [*log.notes, *lerobot.write(made, log, config.fps)]
             made.rename(config.out)
@@ -63,11 +64,6 @@ def to_lerobot(config: ConvertConfig) -> Log:
         print(note)
     print(f"{config.out}: a LeRobotDataset {lerobot.VERSION}")
     return log
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 @contextmanager

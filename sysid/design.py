@@ -73,8 +73,7 @@ def main(config: DesignConfig) -> list[Path]:
         subject = load_subject(config.vehicle)
         for name in config.parameters:
             check_known("--parameters", name, describe(subject.params))
-    spec = subject.spec
-    with refusing():
+        spec = subject.spec
         check_limits(config, spec)
         limits = Limits(
             max(spec.v_min, -1.0) if config.v_min is None else config.v_min,

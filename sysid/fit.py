@@ -35,7 +35,6 @@ from whill_mjx.io.command_line import refusing
 
 KIND = "sysid.fit"
 OUTPUTS = ("series.npz", "model.toml", "model.xml", "trajectories.png", "yaw.png", "errors.png", "close_loop", "steps")
-STOPPED = "stopped; give the same command again to go on."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,12 +114,9 @@ def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None
     """Fit, write and print the summary."""
     for note in log.notes:
         print(note)
-    progress, close = command_line.progress_bar(expected_steps(settings))
-    try:
-        data = Loaded(log, arguments.dataset, {"train": arguments.train, "held_out_selection": arguments.held_out})
+    data = Loaded(log, arguments.dataset, {"train": arguments.train, "held_out_selection": arguments.held_out})
+    with command_line.progress_bar(expected_steps(settings)) as progress:
         report = fit_dataset(data, arguments.out, config=settings, progress=progress, model=model)
-    finally:
-        close()
     for note in (*filter(None, [warning(report)]), *report["dataset"]["notes"][len(log.notes):]):
         print(note)
     print(parameter_table(report))
@@ -138,7 +134,7 @@ def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None
 
 def cli() -> None:
     """Command line."""
-    command_line.run(Arguments, main, __doc__, stopped=STOPPED)
+    command_line.run(Arguments, main, __doc__, stopped=command_line.STOPPED)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from sysid.logs.next_drives import NextDrive, next_drives
 from sysid.logs.records import Log
 from whill_mjx.io.command_line import POSITIVE, Range
 from whill_mjx.io.fields import in_shell
-from whill_mjx.io.folders import check_file, claim_folder, note_written, whole_file
+from whill_mjx.io.folders import check_file, claim_folder, note_written
 from whill_mjx.io.formats import stamp
 
 KIND = "sysid.inspect"
@@ -91,8 +91,7 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
             raise
         print(f"no {refused}", file=sys.stderr)
         return found
-    with whole_file(picture) as temporary:
-        write_robot(temporary, robot, check.loads)
+    write_robot(picture, robot, check.loads)
     note_written(picture)
     print(f"wrote {picture}", file=sys.stderr)
     return found

@@ -35,7 +35,6 @@ from whill_mjx.vehicle.presets import preset_params
 
 KIND = "sysid.paper"
 OUTPUTS = ("paper.json", "paper.md", "paper.html", "paper_trajectories.png", "paper_yaw.png", "series.npz", "steps")
-STOPPED = "stopped; give the same command again to go on."
 
 
 def select(log: Log, channel: str = "odometry") -> Log:
@@ -94,11 +93,8 @@ def main(config: PaperConfig) -> dict[str, Any]:
         log = load_any(config.dataset)
         select(log, config.channel)
     with run_folder(config.out, KIND, OUTPUTS, {"data": log.sha256, **settings_of(config, ("dataset", "out"))}):
-        progress, close = command_line.progress_bar(config.trials)
-        try:
+        with command_line.progress_bar(config.trials) as progress:
             content, (fit, series) = run(log, config, progress)
-        finally:
-            close()
         write(config.out, content, fit, series, log)
     print(markdown(content))
     print(caution(content))
@@ -108,7 +104,7 @@ def main(config: PaperConfig) -> dict[str, Any]:
 
 def cli() -> None:
     """Command line."""
-    command_line.run(PaperConfig, main, __doc__, stopped=STOPPED)
+    command_line.run(PaperConfig, main, __doc__, stopped=command_line.STOPPED)
 
 
 if __name__ == "__main__":

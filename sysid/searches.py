@@ -81,14 +81,11 @@ def compare(arguments: Arguments, log: Log, problem: Problem) -> list[Trace]:
     judge = Judge(problem, log)
     effort = Effort(arguments.trials, arguments.iterations, arguments.starts)
     traces = []
-    progress, close = command_line.progress_bar(len(arguments.methods) * len(arguments.seeds), "searches")
-    try:
+    with command_line.progress_bar(len(arguments.methods) * len(arguments.seeds), "searches") as progress:
         for method in arguments.methods:
             for seed in arguments.seeds:
                 traces.append(trace(problem, judge, method, seed, effort))
                 progress(1, f"{method}: cost {traces[-1].cost[-1]:.4g}")
-    finally:
-        close()
     write(arguments.out, log, traces, problem.space.names)
     for row in arrivals(traces):
         print("  ".join(f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"

@@ -223,11 +223,8 @@ def _fitted(log: Path, out: Path, stage: Stage) -> Path:
 
     stage(f"vehicle: fitting to the driving log {log.name}, usually 1 to 3 minutes")
     config = FitConfig(quick=True)
-    progress, close = progress_bar(expected_steps(config))
-    try:
+    with progress_bar(expected_steps(config)) as progress:
         report = fit_dataset(log, out, config=config, progress=progress)
-    finally:
-        close()
     for line in in_words(report):
         say(f"  {line}")
     say(f"  report of the fit: {out / 'report.html'}")

@@ -1,9 +1,6 @@
-"""What is minimised: the motion of drives in short bins, whitened by the noise that replicates or the fit itself
-leave.
+"""Errors of motion in short bins, whitened by the noise that replicates or the fit itself leave (docs/fit_method.md).
 
-A pose adds up all disturbances before it, so errors of whole poses are correlated over a drive. Errors of the motion
-within a quarter of a second hardly reach beyond it; a vector autoregression makes them white (`sysid.errors.noise`).
-Where wheels are pulled hard, bins count by the noise that they have there. Generalised least squares: Aitken (1936).
+A vector autoregression makes them white (`sysid.errors.noise`): generalised least squares, Aitken (1936).
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ import numpy as np
 from sysid.errors.features import ENOUGH, Features, bin_width, make_features
 from sysid.errors.noise import ORDER, Whitener, first_scales, fit_roughness, fit_whitener, replicate_groups, roughness
 from sysid.errors.normal_equations import NormalEquations, make_equations
-from sysid.errors.pose_objective import HUGE, Objective, Replays, append_prior
+from sysid.errors.pose_objective import HUGE, Objective, Replays, append_prior, linear_with_prior
 from sysid.errors.prior import Prior
 from sysid.errors.space import STEP, Space
 from sysid.logs.records import Trial
@@ -97,11 +94,6 @@ class FeatureObjective:
         coefficients = np.pad(filters.coefficients, ((0, max(LONG - lags, 0)), (0, 0), (0, 0)))
         return self.target, self.mask, filters.scale, coefficients, filters.inverse, self.prior
 
-    @property
-    def kind(self) -> Any:
-        """As in `sysid.errors.normal_equations`."""
-        return FeatureObjective
-
     def with_arrays(self, arrays: tuple[Any, ...]) -> FeatureObjective:
         """The same with other `arrays`."""
         return replace(self, target=arrays[0], mask=arrays[1], whitener=Whitener(*arrays[2:5]), prior=arrays[5])
@@ -120,10 +112,7 @@ class FeatureObjective:
         high, low = white[count:].reshape(2, count, size, *white.shape[1:])
         lost = _bad(at[:count])[:, None] | _bad(at[count:]).reshape(2, count, size, -1, 1).any(0)
         slope = np.where(np.moveaxis(lost, 1, -1), 0.0, pairs.slopes(high, low))
-        if self.prior is None:
-            return white[:count], slope
-        known = np.tile(np.diag(self.prior.slope), (count, 1, 1))
-        return append_prior(white[:count], self.prior.residual(u)), append_prior(slope, known)
+        return linear_with_prior(self.prior, u, white[:count], slope)
 
     def renewed(self, u: np.ndarray) -> FeatureObjective:
         """The same with the noise that u (P,) leaves: its memory, and how much larger it is where wheels are pulled."""

@@ -1,5 +1,4 @@
-"""What is compared when the loop is closed: motion in short bins, in the frame that the vehicle had at the bin's
-start.
+"""Motion in short bins, in the frame that the vehicle had at the bin's start.
 
 It needs no start pose, its noise is nearly stationary, and an effect shows in it at the time and place where it acts.
 """
@@ -17,11 +16,8 @@ from sysid.replay.records import Measured, Simulated
 
 BIN = 0.25  # s
 CHANNELS = ("odometry.v", "odometry.omega", "pose.forward", "pose.left", "pose.yaw")
-"""Mean reported speeds, and displacement over a bin divided by its length [m/s, rad/s].
-
-Without the pose that the odometry adds up: its updates come in steps of its own clock, and fits with it foretold
-held-out drives worse (docs/fit.md).
-"""
+"""Mean reported speeds, and displacement over a bin divided by its length [m/s, rad/s]; without the pose that the
+odometry adds up, whose updates come in steps of its own clock (docs/fit.md)."""
 GYRO = "gyro.omega"  # mean yaw rate of a gyro in a bin [rad/s]: a channel where a log has one
 MAX_GAP = 0.6  # of a bin: a longer gap between samples leaves the bins it touches unmeasured
 LONG_AGO = -1e6  # s

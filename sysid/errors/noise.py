@@ -1,9 +1,7 @@
 """What differs between two equal drives, the filter that makes it white, and how noisy channels are beside a reference.
 
-Residuals of drives are autocorrelated and their channels correlated; tests that assume independence find effects in
-nothing: a vector autoregression whitens them. The level of a channel is the median of second differences in time. A
-missing effect is smooth and hardly shows in them, and lost commands or a soft patch do not move a median. With
-replicates, differences are of their deviations from one another, else of what the model leaves at constant commands.
+The level of a channel is the median of second differences in time, of replicates' deviations from one another or else
+of what the model leaves at constant commands. A missing effect is smooth and hardly shows in them.
 """
 
 from __future__ import annotations
@@ -35,11 +33,8 @@ class Whitener:
     inverse: np.ndarray  # (C, C) L^-1
 
     def apply(self, series: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """White series (B, K, C, ...) of such series.
-
-        `mask`: (B, K, C) weights of the bins, less than 1 where the noise is larger than usual, 0 where nothing was
-        measured.
-        """
+        """White series (B, K, C, ...) of such series; `mask`: (B, K, C) weights of the bins, 0 where nothing was
+        measured."""
         extra = (1,) * (series.ndim - 3)
         shown = mask.reshape(*mask.shape, *extra)
         scaled = series / self.scale.reshape(-1, *extra) * shown
@@ -80,10 +75,9 @@ ROUGH = (0.1, 0.5, 1.5)  # accelerations [m/s^2] between which a bin counts as e
 
 
 def roughness(simulated: np.ndarray, width: float, track: float) -> np.ndarray:
-    """(B, K) class of each bin, 0 to 3, by the largest acceleration of a wheel around it in simulated features.
-
-    Where wheels are pulled hard they slip and a model is least exact: its leftovers count as noise of their own size.
-    """
+    """(B, K) class of each bin, 0 to 3, by the largest acceleration of a wheel around it: where wheels are pulled hard
+    they slip, and what a model leaves counts as noise of its own size. `simulated`: features; `width` of the bins
+    [s]."""
     speeds = simulated[..., :2] * np.array([1.0, track / 2])
     change = np.abs(np.diff(speeds, axis=1, prepend=speeds[:, :1])).sum(-1) / width
     padded = np.pad(change, ((0, 0), (3, 1)))
@@ -108,6 +102,14 @@ def fit_roughness(series: np.ndarray, mask: np.ndarray, level: np.ndarray) -> np
 def replicate_groups(trials: tuple[Trial, ...]) -> list[list[int]]:
     """Indices of trials with the same commands at the same time, so that their bins correspond, by first appearance."""
     return same_course(trials, BIN_SHIFT)
+
+
+def courses_of(trials: Sequence[Trial]) -> np.ndarray:
+    """(B,) number of the group of replicates that each trial is in."""
+    courses = np.zeros(len(trials), int)
+    for number, group in enumerate(replicate_groups(tuple(trials))):
+        courses[group] = number
+    return courses
 
 
 def repeated(trials: Sequence[Trial]) -> bool:
@@ -202,10 +204,8 @@ class NoiseLevels:
 
 
 def noise_levels(ours: NoisyDrives, theirs: NoisyDrives, channels: Sequence[str], alpha: float) -> NoiseLevels | None:
-    """Noise of some drives beside that of the reference's; None where too little was measured.
-
-    `alpha`: probability that any channel counts as changed where the noise is as usual.
-    """
+    """Noise of some drives beside that of the reference's; None where too little was measured. `alpha`: probability
+    that any channel counts as changed where the noise is as usual."""
     for parts in (_between_replicates, _in_steady_motion):
         mine, usual = _size(parts(ours)), _size(parts(theirs))
         if mine is None or usual is None:
@@ -241,8 +241,7 @@ def said(levels: Mapping[str, Mapping[str, Any]], alone: bool) -> str:
     return "; ".join([*parts, *["nothing else has changed"] * (alone and bool(parts))])
 
 
-Parts = list[tuple[np.ndarray, np.ndarray]]
-"""Independent parts of some drives: series (n, K, C), and which bins count (n, K, C)."""
+Parts = list[tuple[np.ndarray, np.ndarray]]  # independent parts: series (n, K, C), and which bins count (n, K, C)
 
 
 def _between_replicates(drives: NoisyDrives) -> Parts:

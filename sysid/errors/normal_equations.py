@@ -8,54 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.errors.space import STEP, Space, huber_weight, robust_cost
+from sysid.errors.space import STEP, huber_weight, robust_cost
 from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_processor
-from sysid.replay.records import Simulated
 
-DRIVES = 32768
-"""Drives replayed by one call, as near as sets allow: an accelerator takes as long for a few (an H100 0.30 s for 2,000,
-0.33 s for these), and each number is compiled once."""
+DRIVES = 32768  # replayed by one call, as near as sets allow: an accelerator takes as long for a few
 STATES = 2**27  # states recorded by one call at most: 5 GB, several times as much with what is made of them
 SEARCHES, FEW = 32, 8
-"""Sets whose gradients and Hessians are made together: as many at least as a search has starts, and so few where no
-more of them go on, or where it has a single one."""
+"""Sets whose gradients and Hessians are made together: as many at least as a search has starts, or few go on."""
 _COMPILERS = ThreadPoolExecutor(10)  # as many functions as a search has
 
 
-class Traceable(Protocol):
-    """`sysid.errors.pose_objective.Objective` or `sysid.errors.bin_objective.FeatureObjective`."""
-
-    @property
-    def space(self) -> Space: ...
-
-    @property
-    def replay(self) -> Any: ...
-
-    @property
-    def arrays(self) -> Any:
-        """What objectives of the same replay differ in; with the same `kind` they share what is compiled."""
-
-    @property
-    def kind(self) -> Any: ...
-
-    def with_arrays(self, arrays: Any) -> Traceable: ...
-
-    def residuals(self, u: Any, simulated: Simulated | None = None) -> Any: ...
-
-    def bad(self, simulated: Simulated) -> Any: ...
-
-
 class Sums:
-    """Compiled sums over the residuals of an objective."""
+    """Compiled sums over the residuals of an objective, which all objectives of its class and replay share."""
 
-    def __init__(self, objective: Traceable):
+    def __init__(self, objective: Any):
+        """`objective`: `Objective` or `FeatureObjective`; its `arrays` are what those of the same replay differ in."""
         def residual(u: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
             """White residuals (B, K) of one set (P,), and the replays (B,) that diverged."""
             one = objective.with_arrays(arrays)
@@ -97,12 +71,12 @@ class Sums:
 class NormalEquations:
     """Sums over the residuals of one objective."""
 
-    def __init__(self, objective: Traceable, at_once: int):
+    def __init__(self, objective: Any, at_once: int):
         """`at_once` is the number of sets that are replayed together."""
         compiled = objective.replay.compiled
-        if objective.kind not in compiled:
-            compiled[objective.kind] = Sums(objective)
-        self.sums: Sums = compiled[objective.kind]
+        if type(objective) not in compiled:
+            compiled[type(objective)] = Sums(objective)
+        self.sums: Sums = compiled[type(objective)]
         self._arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), objective.arrays)
         parameters = objective.space.size
         many = max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))
@@ -144,7 +118,7 @@ def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) ->
             _ = objective.equations
 
 
-def make_equations(objective: Traceable) -> NormalEquations | None:
+def make_equations(objective: Any) -> NormalEquations | None:
     """Those of an objective whose replay an accelerator computes; None on a processor, where residuals are at hand."""
     replay = objective.replay
     if not summed_there(replay):

@@ -128,13 +128,8 @@ class Objective:
 
     @property
     def arrays(self) -> tuple[Any, ...]:
-        """What it may differ in from others of the same replay and `kind`."""
+        """What it may differ in from others of the same replay."""
         return self.noise.pose, self.noise.odometry, self.prior, self.noise.gyro
-
-    @property
-    def kind(self) -> Any:
-        """As in `sysid.errors.normal_equations`."""
-        return Objective
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> Objective:
         """The same with other `arrays`."""
@@ -194,10 +189,7 @@ class Objective:
         residual, jacobian = self._whiten(simulated, derivative)
         assert jacobian is not None
         jacobian = jacobian * self.space.slope(u)[:, None, None, :]
-        if self.prior is None:
-            return residual, jacobian
-        slope = np.tile(np.diag(self.prior.slope), (len(u), 1, 1))
-        return append_prior(residual, self.prior.residual(u)), append_prior(jacobian, slope)
+        return linear_with_prior(self.prior, u, residual, jacobian)
 
     def renewed(self, u: np.ndarray) -> Objective:
         """The same with the noise that u (P,) leaves, where it was not known."""
@@ -369,6 +361,16 @@ class _StartError:
 def without_prior(objective: DriveResiduals, table: np.ndarray) -> np.ndarray:
     """Table (B, K, ...) of the measurements alone."""
     return table if objective.prior is None else table[:, : -objective.space.size]
+
+
+def linear_with_prior(
+    prior: Prior | None, u: np.ndarray, residual: np.ndarray, jacobian: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (N, B, K) and Jacobian (N, B, K, P) at u (N, P) with those of a prior, if there is one."""
+    if prior is None:
+        return residual, jacobian
+    slope = np.tile(np.diag(prior.slope), (len(u), 1, 1))
+    return append_prior(residual, prior.residual(u)), append_prior(jacobian, slope)
 
 
 def append_prior(table: np.ndarray, more: np.ndarray) -> np.ndarray:

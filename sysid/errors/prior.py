@@ -1,7 +1,6 @@
 """What is known of a vehicle before its log is fitted: the bounds of its parameters, or a vehicle file.
 
-A parameter of which a log says next to nothing would follow folds of the cost to an end of its range. A normal
-distribution as wide as its bounds holds it back; what a log determines is hardly moved.
+A normal distribution as wide as the bounds keeps a parameter of which a log says next to nothing from drifting.
 """
 
 from __future__ import annotations
@@ -14,8 +13,7 @@ from flax import struct
 
 from sysid.errors.space import Space
 
-SPREAD = 0.05
-"""Day-to-day standard deviation of a parameter, as a share of its value: an assumption, printed with the fit."""
+SPREAD = 0.05  # assumed day-to-day standard deviation of a parameter, as a share of its value; printed with the fit
 LEAST = 0.003  # of the range: what no parameter is known better than
 UNKNOWN = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known (uniform)
 EXPECTED = {
@@ -34,8 +32,7 @@ class Prior:
 
     mean: np.ndarray  # (P,)
     sd: np.ndarray  # (P,)
-    share: float = 1.0
-    """Factor on its precision: residuals of drives are autocorrelated and count more often than their information."""
+    share: float = 1.0  # factor on its precision: autocorrelated residuals count more often than their information
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """(N, P) of unit coordinates (N, P), to be squared."""

@@ -31,8 +31,7 @@ FIXED = {
 NUISANCE = {
     "torque_drive.period": "this log cannot determine it; it is free so that it does not bias the others",
 }  # searched, but never reported as determined: what its curvature at one point says holds nowhere else
-BENT = ("body.com_z",)
-"""A log determines them better or worse by their own value: the load that driving shifts goes with the height."""
+BENT = ("body.com_z",)  # a log determines them better or worse by their own value: driving shifts load by the height
 LOADED = "slip_traction.mu"  # with it, wheels skid by their load, and brakes and turns show how high the mass lies
 
 
@@ -91,11 +90,16 @@ class Space:
     def size(self) -> int:
         return len(self.names)
 
+    @property
+    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds (P,) of what is searched by its logarithm; of the others numbers whose logarithm is finite."""
+        return np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+
     def to_values(self, u: Any) -> Any:
         """Values (..., P) of unit coordinates (..., P), which are clipped to [0, 1]."""
         xp = namespace(u)
         u = xp.clip(u, 0.0, 1.0)
-        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        low, high = self._ends
         return xp.where(self.log, low * (high / low) ** u, self.low + u * (self.high - self.low))
 
     def to_unit(self, values: np.ndarray) -> np.ndarray:
@@ -104,21 +108,20 @@ class Space:
 
     def _unit(self, values: np.ndarray) -> np.ndarray:
         """Those of values (..., P) that may lie outside the range."""
-        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        low, high = self._ends
         logarithm = np.log(np.maximum(np.where(self.log, values, 1.0) / low, 1e-300)) / np.log(high / low)
         return np.where(self.log, logarithm, (values - self.low) / (self.high - self.low))
 
     def slope(self, u: np.ndarray) -> np.ndarray:
         """d value / d u (..., P)."""
-        low, high = np.where(self.log, self.low, 1.0), np.where(self.log, self.high, 2.0)
+        low, high = self._ends
         return np.where(self.log, self.to_values(u) * np.log(high / low), self.high - self.low)
 
     def moved(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Unit coordinates (N, P) a step (N, P) from u (N, P), along the valley of what drives fix per inertia only.
 
-        Heavier wheels with as much larger torques drive alike. Torques grow in proportion to an inertia of which the
-        wheels' is one of two terms, so that valley is curved, and a straight step leads far up its sides. The first
-        order is unchanged.
+        Heavier wheels with as much larger torques drive alike. The wheels' inertia is one of two terms of what torques
+        turn, so that valley is curved. The first order is that of a straight step.
         """
         end = u + step
         if self.turned is None or RATIO not in self.names:
@@ -137,16 +140,11 @@ class Space:
                 values[:, i] = grown_value * grown - constant - share * later
         return np.where([name in besides for name in self.names], self._unit(values), end)
 
-    def subset(self, keep: Sequence[str]) -> Space:
-        """The space of the named parameters only."""
-        index = [self.names.index(name) for name in keep]
-        return replace(self, names=tuple(keep), low=self.low[index], high=self.high[index],
-                       initial=self.initial[index], log=self.log[index])
-
     def without(self, name: str, reason: str) -> Space:
         """The space in which one parameter keeps its value."""
-        kept = self.subset([one for one in self.names if one != name])
-        return replace(kept, fixed=(*self.fixed, (name, reason)))
+        kept = [i for i, one in enumerate(self.names) if one != name]
+        return replace(self, names=tuple(self.names[i] for i in kept), low=self.low[kept], high=self.high[kept],
+                       initial=self.initial[kept], log=self.log[kept], fixed=(*self.fixed, (name, reason)))
 
 
 # Factors on the starting value, for what a preset scales with the vehicle, from 3 kg to 300 kg.
@@ -173,10 +171,8 @@ def vehicle_bounds(names: Sequence[str], initial: np.ndarray, spec: VehicleSpec)
 
 
 def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
-    """What a fit searches by default: all but `FIXED`, and the height of the mass where wheels may skid.
-
-    `asked`: effects asked for; lateral damping of driven wheels, which slip besides, is searched only then.
-    """
+    """What a fit searches by default: all but `FIXED`, and the height of the mass where wheels may skid. Lateral
+    damping of driven wheels, which slip besides, is searched only where it is `asked` for."""
     from whill_mjx.vehicle.parameters import describe
 
     about = describe(params)
@@ -189,11 +185,9 @@ def searched(params: Any, asked: Sequence[str] = ()) -> list[str]:
 
 
 def make_space(params: Any, spec: VehicleSpec, names: Sequence[str] | None = None) -> Space:
-    """Space of a vehicle's parameters, from their values in `params`, with `vehicle_bounds`, or their described
-    bounds, which are the chair's, in proportion to the vehicle.
-
-    `names`: what to search; by default everything but `FIXED` and limits that are not there.
-    """
+    """Space of a vehicle's parameters, from their values in `params`, with `vehicle_bounds` or their described bounds
+    in proportion to the vehicle. `names`: what to search; by default everything but `FIXED` and limits that are not
+    there."""
     from whill_mjx.vehicle.parameters import describe, get_values
 
     about = describe(params)
@@ -223,11 +217,6 @@ def _in_proportion(name: str, about: Parameter, spec: VehicleSpec) -> tuple[floa
     file = parameter_field(name, about.unit, about.low, about.high, about.neutral, (spec.mass, spec.wheel_radius))
     low, high = file.low + ROUNDING * abs(file.low), file.high - ROUNDING * abs(file.high)
     return max(times * about.low, low), min(times * about.high, high)
-
-
-def is_delay(name: str) -> bool:
-    """Whether a parameter shifts time: its error landscape has steps, so it is profiled on a grid as well."""
-    return "delay" in name or "latency" in name
 
 
 class Residuals(Protocol):

@@ -1,10 +1,8 @@
 """The next drive: the one that separates effects which these drives do not.
 
-Rivals are an accepted effect, the others of its class, and those whose refit came close to it. Each is simulated at its
-own fitted values on every drive of a library. What base parameters within their spread and the other's own coordinates
-can absorb is projected out of the difference of two; the rest, in standard deviations of the noise, is how well a drive
-separates them. The drive with the largest worst case is proposed; all last as long as the log's longest trial, so that
-they go through the replay that is compiled.
+Rivals are simulated at their own fitted values on every drive of a library. What base parameters within their spread
+and the other's own coordinates can absorb is projected out of the difference of two. The drive with the largest worst
+case is proposed. All last as long as the log's longest trial, so that they go through the compiled replay.
 """
 
 from __future__ import annotations
@@ -36,8 +34,7 @@ from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL
 
 FILE = "next_command.csv"
 TIE = 0.2  # A refit whose gain falls short of the best one's by less than this share is a rival
-LEAST, ENOUGH = 3.0, 5.0
-"""Standard deviations from which a drive counts as telling two effects apart, and that repetitions should reach."""
+LEAST, ENOUGH = 3.0, 5.0  # standard deviations by which a drive separates effects, and that repetitions should reach
 MOST_REPEATS = 9
 SIZES = (1.0, 0.5, 0.2)  # shares of the log's largest speed and yaw rate that every manoeuvre is tried at
 HEADINGS = (0.0, 90.0, 180.0, 270.0)  # start headings [degrees] that are tried where a rival is fixed in the room
@@ -206,7 +203,7 @@ def plan_drives(result: Result, drives: Drives, library: Sequence[PlannedDrive])
         # A replay that was compiled for trials that start in motion settles every trial: a start just off rest does so.
         start = Start(x, y, heading, v=1e-9 if moving else 0.0)
         planned.append(_as_trial(one.command, start, longest, *counts))
-    return drives.of(tuple(planned), result.plant.dt)
+    return drives.of(tuple(planned))
 
 
 def separations(
@@ -262,20 +259,16 @@ def _own_columns(refitter: Refitter, drives: Drives, fit: Refit, at: np.ndarray)
 
 def _held(result: Result, fit: Refit) -> np.ndarray:
     """(P + k, P + k) precision of a rival on a new day: base by the spread, coordinates by drives and wander."""
-    size = len(fit.u)
-    flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
-    matrix = flat.T @ flat
-    inside = matrix[:size, :size] + result.evidence.precision
+    size, precision = len(fit.u), result.evidence.precision
+    matrix = fit.products(precision)
     cross = matrix[:size, size:]
     out = np.zeros_like(matrix)
-    out[:size, :size] = result.evidence.precision
-    separable = matrix[size:, size:] - cross.T @ np.linalg.solve(inside, cross)
-    covariance, start = np.linalg.inv(separable + 1e-9 * np.eye(len(separable))), 0
-    for one, q in zip(fit.hypotheses, fit.split, strict=True):
-        part = slice(start, start + len(q))
+    out[:size, :size] = precision
+    separable = matrix[size:, size:] - cross.T @ np.linalg.solve(matrix[:size, :size], cross)
+    covariance = np.linalg.inv(separable + 1e-9 * np.eye(len(separable)))
+    for one, part in zip(fit.hypotheses, fit.parts, strict=True):
         covariance[part, part] += result.prepared.wander.at(
-            result.evidence.columns, result.hypotheses.index(one), q)
-        start += len(q)
+            result.evidence.columns, result.hypotheses.index(one), fit.q[part])
     out[size:, size:] = np.linalg.inv(covariance)
     return out
 

@@ -1,13 +1,8 @@
-"""What these very drives can show: how often they raise a false alarm, how surely an effect is noticed, and
-what a p-value of the search comes to where nothing is missing.
+"""What these very drives can show, on simulated days: false alarms, power, and what a p-value of the search comes to.
 
-Days with nothing missing are simulated as the nulls of the scan are, but drawn anew; an effect adds its columns.
-Linear, like the scan: `--refit-nulls` measures the false alarms of the whole procedure.
-
-The p-value of the search assumes that drives differ from the reference days as these do from each other. Real days do
-so only roughly: small values come too often, and those that a refit takes back end at 1. On logs of an independent
-plant with nothing in them they follow a Beta distribution (`benchmarks.undeclared --calibrate` fits it), whose
-distribution function makes them uniform there. It decides nothing: verdicts go by the p-values of the search.
+Linear, like the scan: `--refit-nulls` measures the false alarms of the whole procedure. Real days differ only roughly
+as the reference days do, so small p-values come too often. On logs of an independent plant with nothing in them they
+follow a Beta distribution (`benchmarks.undeclared --calibrate`), which `calibrated` takes off. It decides nothing.
 """
 
 from __future__ import annotations
@@ -25,8 +20,8 @@ from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander
 from sysid.missing.evidence import Columns, Evidence, Solver
-from sysid.verdict.found import Scan, family, tail
-from sysid.verdict.scan import NullDays, look
+from sysid.verdict.found import Scan, family, tails
+from sysid.verdict.scan import NullDays, worth_on
 
 DRAWS = 200
 SEED = 3  # beside that of the scan's nulls
@@ -54,13 +49,10 @@ class Days:
         added = np.stack([products[:, list(columns.index)] @ q for columns, q in effects]) if effects else np.zeros(
             (1, len(products)))
         moments = (added[:, None] + self.nulls.moments).reshape(-1, len(products))
-        solver, worth = Solver(self.evidence), np.zeros((len(moments), len(self.hypotheses)))
-        for number, (one, covariance) in enumerate(zip(self.evidence.columns, self.wander.covariance, strict=True)):
-            away = np.tile(self.wander.away(number, self.nulls.share), (len(added), 1))
-            found = look(solver, one, self.hypotheses[one.hypothesis].axes, covariance, moments, away)
-            worth[:, one.hypothesis] = np.maximum(worth[:, one.hypothesis], found.worth)
-        each = np.stack([tail(self.scan.null[:, h], worth[:, h]) for h in range(len(self.hypotheses))], axis=-1)
-        return np.array([family(self.scan.smallest, float(one)) for one in each.min(1)]).reshape(-1, draws)
+        days = NullDays(moments, np.tile(self.nulls.share, (len(added), 1)))
+        worth = worth_on(days, Solver(self.evidence), self.hypotheses, self.wander)
+        smallest = tails(self.scan.null, worth).min(1)
+        return np.array([family(self.scan.smallest, float(one)) for one in smallest]).reshape(-1, draws)
 
     def noticed(self, alpha: float, effects: Sequence[Effect]) -> list[float]:
         """Of each effect the share of days on which something counts as missing."""

@@ -5,20 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from sysid.missing.joint_fit import Refit, Start
 from sysid.missing.unexplained import held_back_gains
-from sysid.verdict.agreement import with_prior
+from sysid.verdict.agreement import interval_of_sum, with_prior
 from sysid.verdict.result import Result
+from sysid.verdict.vehicles import refitter_of
 
 CONFIDENCE = 0.95
 FOLLOWED = 0.9  # largest share of a direction's information in one manoeuvre with which its residual is enlarged
 NEARLY = 0.9  # share of the largest size that is looked for from which a size is at its end
 MOVED = 0.01  # p-value of how far base parameters went, below which they went further than from day to day
-LAW = ("speed", "yaw rate", "size of the step")
-"""Quantities by which effects that act at the same times have different laws."""
-UNDONE = 0.5
-"""What two effects change together, as a share of what each does by itself, below which one may stand for both."""
+LAW = ("speed", "yaw rate", "size of the step")  # by which effects that act at the same times differ
+UNDONE = 0.5  # what two effects change together, as a share of what each does, below which one may stand for both
 
 
 def contradicted(result: Result) -> list[str]:
@@ -34,8 +34,7 @@ class Doubt:
 
     text: str
     remedy: str
-    about_rest: bool = False
-    """Whether it is about what the named effects leave, which does not matter where drives are predicted well."""
+    about_rest: bool = False  # whether it is about what is left, which does not matter where drives are predicted well
 
 
 def warnings(result: Result) -> list[str]:
@@ -44,10 +43,8 @@ def warnings(result: Result) -> list[str]:
 
 
 def advice(result: Result, as_good_as_repeats: bool) -> list[str]:
-    """Of the doubts those that change what a reader should do, each with what that is.
-
-    `as_good_as_repeats`: with the named effects, drives are predicted to within what repeats differ by.
-    """
+    """The doubts that change what a reader should do, each with what that is. `as_good_as_repeats`: with the named
+    effects, drives are predicted to within what repeats differ by."""
     return [f"{one.text[0].upper()}{one.text[1:]}. {one.remedy}" for one in doubts(result)
             if not (one.about_rest and as_good_as_repeats)]
 
@@ -56,8 +53,7 @@ def as_good_as_repeats(errors: np.ndarray, floor: float | None) -> bool:
     """Whether errors of drives (B,) are, as far as so few show, no larger than what repeats differ by."""
     if floor is None or len(errors) == 0:
         return False
-    drawn = np.random.default_rng(0).integers(0, len(errors), (2000, len(errors)))
-    return bool(np.quantile(errors[drawn].mean(1), 0.025) <= floor)
+    return interval_of_sum(errors)[0] <= floor * len(errors)
 
 
 def doubts(result: Result) -> list[Doubt]:
@@ -116,15 +112,8 @@ def at_the_end(result: Result) -> list[str]:
 
 
 def beside_still_base(result: Result, iterations: int = 8) -> list[Refit]:
-    """The final effects fitted beside base parameters that hardly move; nothing where these moved as days do.
-
-    Base parameters that mend a form which is not quite right take a part of the effect along or give it one: how much
-    lies between this fit and the final one.
-    """
-    from scipy import stats
-
-    from sysid.verdict.vehicles import refitter_of
-
+    """The final effects fitted beside base parameters that hardly move; nothing where these moved as days do. Between
+    this fit and the final one lies how much of the effect base parameters take along or give it."""
     final, reference = result.search.final, result.reference
     away = final.u - reference.u
     if not reference.known or away @ result.evidence.precision @ away < stats.chi2.isf(MOVED, len(away)):
@@ -135,8 +124,6 @@ def beside_still_base(result: Result, iterations: int = 8) -> list[Refit]:
 
 def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
     """Ends (k,), (k,) of the coordinates' confidence intervals."""
-    from scipy import stats
-
     quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(result.evidence.groups) - 1, 1))
     reach = quantile * deviations(final, result)
     axes = [axis for one in final.hypotheses for axis in one.axes]
@@ -148,11 +135,8 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
 
 def deviations(final: Refit, result: Result) -> np.ndarray:
     """(k,) standard errors of the coordinates: from whole manoeuvres, which a wrong form pulls each its own way, and
-    what the coordinates seem to be on days without the effect.
-
-    What a manoeuvre leaves is smaller than its error by what the fit followed it: the more, the more of a direction it
-    informs (bias-reduced linearisation, Bell and McCaffrey 2002). Where it has nearly all, none can contradict it.
-    """
+    what the coordinates seem to be on days without the effect. What a manoeuvre leaves is enlarged by how far the fit
+    followed it (bias-reduced linearisation, Bell and McCaffrey 2002)."""
     groups = result.evidence.groups
     matrix, size = with_prior(final, result.evidence.precision), len(final.u)
     root = np.linalg.inv(np.linalg.cholesky(matrix))

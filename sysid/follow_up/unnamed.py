@@ -1,9 +1,8 @@
 """A wrench without a name for what the catalogue does not have.
 
 A force along the vehicle and a torque about it, as tables over one quantity of the motion, are fitted to what the base
-model leaves: a linear regression of the white residual on what each knot changes, beside the base parameters.
-Manoeuvres that were held back decide which quantity, how smooth, and which sum of few terms stands for the table. The
-winner is replayed as the effect `unnamed`. A table over a wheel's angle starts at its own angle in every drive.
+model leaves. Manoeuvres that were held back decide which quantity, how smooth, and which sum of few terms stands for
+the table. The winner is replayed as the effect `unnamed`.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from sysid.follow_up.wrench_tables import (
     turned,
 )
 from sysid.logs.records import Prediction, Trial
-from sysid.missing.drives import RECORD_DT, Drives, make_drives
+from sysid.missing.drives import RECORD_DT, make_drives
 from sysid.missing.unexplained import ANGLE_PRICE, PHASES, WHEELS
 from sysid.replay.arrays import Quotients
 from sysid.replay.models import with_effects
@@ -44,13 +43,11 @@ from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.types import VehicleParams
 
 KINDS = ("push", "brake")  # A wrench whatever the motion, or one that turns with its direction
-ROOM = ("heading in the room", "x in the room", "y in the room", MAP)
-"""Quantities that only an outside pose shows; replicates, which start elsewhere, differ in them."""
+ROOM = ("heading in the room", "x in the room", "y in the room", MAP)  # only an outside pose shows them
 REST_RANGE = {"time since rest": 4.0, "distance since rest": 0.6}
 FINALISTS = 3  # tables that are fitted to all trials, not to one of each manoeuvre alone
 LEAST = 0.1  # least share of the excess residual that a table must predict on held-back manoeuvres
-LEAST_GAIN = 25.0
-"""Least lowering of their squared white residual: the best of all tables reached 16 in eight draws of noise."""
+LEAST_GAIN = 25.0  # least lowering of their squared white residual, which tables hardly reach on noise
 COMPACT = 0.75  # share of the table's held-back gain that few terms must reach to stand for it
 CHOICES = tuple(Try(1.0, share) for share in (1.0, 0.5, 0.2))
 ROUNDS = 3  # Gauss-Newton steps
@@ -100,8 +97,8 @@ class UnnamedReplays:
         self.drives = drives.weighted(drives.simulate(self.neutral[None])[0], reference.factors, result.log.spec.track)
         weight = 0.01 * result.log.spec.mass * 9.81
         self.sizes = np.repeat([weight, weight * result.log.spec.track / 2], KNOTS)  # N, N m
-        self.target = self.white(self.drives, reference.target_of(self.drives))
-        self.target_shape = self.drives.target.shape
+        self.white = reference.whitener.flat
+        self.target = self.white(reference.target_of(self.drives), self.drives.mask)
 
     def values(self, u: np.ndarray, table: WrenchTable | None = None, wrench: np.ndarray | None = None,
                start: float = 0.0) -> np.ndarray:
@@ -113,43 +110,29 @@ class UnnamedReplays:
                 out[self.names.index(f"unnamed.{name}")] = value
         return out
 
-    def white(self, drives: Drives, series: np.ndarray) -> np.ndarray:
-        """(B, n, ...) white and flat, of (B, K, C, ...)."""
-        return self.result.reference.whitener.flat(series, drives.mask)
-
     def residual(self, points: Sequence[tuple[np.ndarray, np.ndarray]], table: WrenchTable, phases: np.ndarray
                  ) -> np.ndarray:
         """(N, B, n) white residual of all training trials at base coordinates and wrenches, with each trial's turn."""
         turns = sorted(set(phases.tolist()))
         sets = [self.values(u, table, wrench, float(PHASES[turn])) for u, wrench in points for turn in turns]
-        seen = self.drives.simulate(np.stack(sets)).reshape(len(points), len(turns), *self.target_shape)
+        seen = self.drives.simulate(np.stack(sets)).reshape(len(points), len(turns), *self.drives.target.shape)
         chosen = seen[:, [turns.index(turn) for turn in phases.tolist()], np.arange(len(phases))]
-        return np.stack([self.target - self.white(self.drives, one) for one in chosen])
-
-    def part(self, trials: Sequence[int]) -> Drives:
-        """Some of the trials."""
-        chosen = self.drives.of(tuple(self.drives.trials[i] for i in trials), self.result.plant.dt)
-        bins = chosen.features.mask.shape[1]
-        return replace(chosen, weight=self.drives.mask[list(trials), :bins])
+        return np.stack([self.target - self.white(one, self.drives.mask) for one in chosen])
 
     def columns(self, table: WrenchTable, trials: Sequence[int]) -> np.ndarray:
-        """(b, n, 2 KNOTS) change of the white features by each knot, per N and N m."""
-        drives = self.part(trials)
+        """(b, n, 2 KNOTS) change of the white features of some trials by each knot, per N and N m."""
+        drives, mask = self.drives.of(tuple(self.drives.trials[i] for i in trials)), self.drives.mask[list(trials)]
         own = Quotients.forward(np.zeros(2 * KNOTS), self.sizes)
         sets = [self.values(self.u, table, row) for row in own.above]
         seen = drives.simulate(np.stack([self.values(self.u), *sets]))
-        full = np.zeros((len(trials), *self.drives.mask.shape[1:], 2 * KNOTS))
+        full = np.zeros((*mask.shape, 2 * KNOTS))
         full[:, : seen.shape[2]] = own.slopes(seen[1:], seen[0])
-        whole = replace(self.drives, weight=self.drives.mask[list(trials)])
-        return self.white(whole, full)
+        return self.white(full, mask)
 
 
 def find_unnamed(result: Result) -> Unnamed | None:
-    """The wrench over one quantity that best predicts held-back manoeuvres; None unless something is unexplained.
-
-    Where the base model is refitted to whole poses, so is it with the wrench that is kept.
-    """
-
+    """The wrench over one quantity that best predicts held-back manoeuvres, refitted to whole poses like the base
+    model; None unless something is unexplained."""
     if result.search.verdict != "unexplained":
         return None
     found = fit_unnamed(UnnamedReplays(result))
@@ -187,24 +170,21 @@ def fit_unnamed(bench: UnnamedReplays) -> Unnamed:
     if len(groups) < 3:  # too few manoeuvres to hold one back: trials are
         groups = [[i] for i in range(len(result.log.training))]
     residual, jacobian = result.search.base.residual, result.search.base.jacobian
-    firsts = [group[0] for group in groups]
-    screened = []
+
+    def table_fit(table: WrenchTable, trials: list[int], split: list[list[int]]) -> TableFit:
+        columns, phases = turned(table, bench.columns(table, trials), residual[trials])
+        products = multiplied(residual[trials], jacobian[trials], columns, split)
+        gains, smoothing = held_back(products, result.evidence.precision, table)
+        return TableFit(table, gains - price(table, split), smoothing, products, columns, phases)
+
+    firsts, screened = [group[0] for group in groups], []
     for table in tables(result):
         chosen = firsts if table.quantity not in ROOM else sum(groups, [])
         split = [[i] for i in range(len(firsts))] if chosen is firsts else _positions(groups)
-        columns, _ = turned(table, bench.columns(table, chosen), residual[chosen])
-        products = multiplied(residual[chosen], jacobian[chosen], columns, split)
-        gains, _ = held_back(products, result.evidence.precision, table)
-        gains = gains - price(table, split)
-        screened.append((float(gains.sum()) * len(residual) / len(chosen), table))
+        gain = float(table_fit(table, chosen, split).gains.sum())
+        screened.append((gain * len(residual) / len(chosen), table))
     screened.sort(key=lambda one: -one[0])
-    fitted = []
-    for _, table in screened[:FINALISTS]:
-        columns, phases = turned(table, bench.columns(table, range(len(residual))), residual)
-        products = multiplied(residual, jacobian, columns, groups)
-        gains, smoothing = held_back(products, result.evidence.precision, table)
-        gains = gains - price(table, groups)
-        fitted.append(TableFit(table, gains, smoothing, products, columns, phases))
+    fitted = [table_fit(table, list(range(len(residual))), groups) for _, table in screened[:FINALISTS]]
     best = max(fitted, key=lambda one: float(one.gains.sum()))
     excess = max(result.search.excess[0], 1e-9) * float((bench.drives.mask > 0).sum())
     tried = [(one.table.quantity, one.table.kind, float(one.gains.sum()) / excess) for one in fitted]
@@ -215,12 +195,12 @@ def fit_unnamed(bench: UnnamedReplays) -> Unnamed:
 def tables(result: Result) -> list[WrenchTable]:
     """All wrenches that are tried, with the range that the drives cover."""
     trials = result.log.training
-    speeds = [trial.odometry.v if trial.odometry is not None else trial.command.v for trial in trials]
-    rates = [trial.odometry.omega if trial.odometry is not None else trial.command.omega for trial in trials]
-    ranges: dict[str, tuple[float, ...]] = {"time in the drive": (0.0, max(trial.duration for trial in trials))}
-    for name, series in (("speed", speeds), ("yaw rate", rates)):
-        ranges[name] = _range(np.concatenate(series))
-    ranges |= {name: (0.0, end) for name, end in REST_RANGE.items()}
+    motions = [trial.odometry or trial.command for trial in trials]
+    ranges: dict[str, tuple[float, ...]] = {
+        "time in the drive": (0.0, max(trial.duration for trial in trials)),
+        "speed": _range(np.concatenate([one.v for one in motions])),
+        "yaw rate": _range(np.concatenate([one.omega for one in motions])),
+        **{name: (0.0, end) for name, end in REST_RANGE.items()}}
     seen = [trial.ground_truth for trial in trials if trial.ground_truth is not None]
     places = [_range(np.concatenate([getattr(one, name) for one in seen])) for name in "xy"] if seen else []
     if seen:

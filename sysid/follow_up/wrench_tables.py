@@ -6,7 +6,7 @@ algebra.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,44 +21,34 @@ HARMONICS = 3
 class Term:
     """One term: its columns go into a sum together or not at all."""
 
-    form: str  # power, harmonic, sign, decay or log
+    form: str  # harmonic, or one of `FORMS`
     number: float  # exponent, harmonic, or the size over which it acts
 
     def of(self, z: np.ndarray) -> np.ndarray:
         """Values (K, c) at z (K,)."""
-        match self.form:
-            case "harmonic":
-                return np.stack([np.sin(self.number * z), np.cos(self.number * z)], axis=-1)
-            case "sign":
-                return np.tanh(z / self.number)[:, None]
-            case "decay":
-                return np.exp(-z / self.number)[:, None]
-            case "log":
-                return np.log1p(np.maximum(z, 0.0) / self.number)[:, None]
-            case "size":
-                return np.abs(z)[:, None]
-        return z[:, None] ** self.number
+        if self.form == "harmonic":
+            return np.stack([np.sin(self.number * z), np.cos(self.number * z)], axis=-1)
+        return FORMS[self.form][0](z, self.number)[:, None]
 
     def text(self, coefficients: np.ndarray) -> str:
         """The term with its coefficients (c,), with a sign in front."""
-        value = float(coefficients[0])
-        match self.form:
-            case "harmonic":
-                size, phase = float(np.hypot(*coefficients)), float(np.arctan2(coefficients[1], coefficients[0]))
-                angle = "z" if self.number == 1 else f"{self.number:g} z"
-                start = f" {'+' if phase >= 0 else '-'} {abs(phase):.2f}" if abs(phase) >= 0.005 else ""
-                return f"+ {size:.3g} sin({angle}{start})"
-            case "sign":
-                body = f" tanh(z / {self.number:.3g})"
-            case "decay":
-                body = f" exp(-z / {self.number:.3g})"
-            case "log":
-                body = f" ln(1 + z / {self.number:.3g})"
-            case "size":
-                body = " |z|"
-            case _:
-                body = {0.0: "", 1.0: " z"}.get(self.number, f" z^{self.number:g}")
+        if self.form == "harmonic":
+            size, phase = float(np.hypot(*coefficients)), float(np.arctan2(coefficients[1], coefficients[0]))
+            angle = "z" if self.number == 1 else f"{self.number:g} z"
+            start = f" {'+' if phase >= 0 else '-'} {abs(phase):.2f}" if abs(phase) >= 0.005 else ""
+            return f"+ {size:.3g} sin({angle}{start})"
+        value, body = float(coefficients[0]), FORMS[self.form][1](self.number)
         return f"{'+' if value >= 0 else '-'} {abs(value):.3g}{body}"
+
+
+FORMS: dict[str, tuple[Callable[[np.ndarray, float], np.ndarray], Callable[[float], str]]] = {
+    "power": (lambda z, n: z**n, lambda n: {0.0: "", 1.0: " z"}.get(n, f" z^{n:g}")),
+    "sign": (lambda z, n: np.tanh(z / n), " tanh(z / {:.3g})".format),
+    "decay": (lambda z, n: np.exp(-z / n), " exp(-z / {:.3g})".format),
+    "log": (lambda z, n: np.log1p(np.maximum(z, 0.0) / n), " ln(1 + z / {:.3g})".format),
+    "size": (lambda z, _: np.abs(z), lambda _: " |z|"),
+}  # fmt: skip
+"""Terms of one column: their values at z, and how they read."""
 
 
 def library(knots: np.ndarray, periodic: bool) -> tuple[Term, ...]:
@@ -90,11 +80,8 @@ def forward_selection(
     matrix: np.ndarray, moments: np.ndarray, size: int, groups: Sequence[Sequence[int]], most: int
 ) -> list[list[int]]:
     """Terms of the best sum of 1, 2, ... `most` terms: each joins the one before that lowers the squares most.
-
-    Args:
-        matrix, moments: products (P + T, P + T) and (P + T,) with the base's P = size columns in front, prior included.
-        groups: columns of each term, counted after those of the base.
-    """
+    `matrix`, `moments`: products (P + T, P + T) and (P + T,) with the base's P = size columns in front, prior included;
+    `groups`: columns of each term, counted after those of the base."""
     chosen: list[int] = []
     path = []
     while len(chosen) < min(most, len(groups)):
@@ -121,8 +108,7 @@ def in_words(terms: Sequence[Term], coefficients: Sequence[np.ndarray], half: in
     return " ".join(texts).removeprefix("+ ")
 
 
-SMOOTHING = (0.01, 0.1, 1.0, 10.0)
-"""Weights of the tables' second differences that are tried, as shares of the drives' information on a knot."""
+SMOOTHING = (0.01, 0.1, 1.0, 10.0)  # weights of second differences that are tried, as shares of a knot's information
 SHRINK = 0.01  # of that weight, on the tables themselves
 MOST_TERMS = 3
 WORTH = 0.05  # share of the held-back gain that a further term must add
@@ -301,9 +287,7 @@ def turned(table: WrenchTable, columns: np.ndarray, residual: np.ndarray) -> tup
                      ]), phases
 
 
-def from_first_wave(
-    terms: Sequence[Term], coefficients: Sequence[np.ndarray]
-) -> tuple[tuple[np.ndarray, ...], float]:
+def from_first_wave(terms: Sequence[Term], coefficients: Sequence[np.ndarray]) -> tuple[tuple[np.ndarray, ...], float]:
     """The same waves counted from where the first of the force rises through zero, and the angle [rad] to there."""
     first = next((values for term, values in zip(terms, coefficients, strict=True)
                   if term.form == "harmonic" and term.number == 1), None)

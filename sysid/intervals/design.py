@@ -29,14 +29,12 @@ class Plan:
     """One candidate and its information."""
 
     candidate: Candidate
-    deviation: np.ndarray
-    """(P,) standard deviations after the drive, in unit coordinates; those of the bounds where nothing is known."""
+    deviation: np.ndarray  # (P,) standard deviations after the drive, in unit coordinates; those of the bounds at most
     trace: float  # sum of variances over the identifiable subspace, relative to that before the drive
     volume: float  # logarithm of the ratio of volumes after and before: -0.69 per halved standard deviation
     information: np.ndarray  # (P, P) in unit coordinates
     path: np.ndarray  # (T, 2) m, simulated, from the start pose
-    start: tuple[float, float, float]
-    """x, y [m] from a corner of the room and heading [rad] at which the path stays inside."""
+    start: tuple[float, float, float]  # x, y [m] from a corner of the room and heading [rad]
 
     def score(self, criterion: Criterion) -> float:
         """The less the better."""

@@ -1,19 +1,9 @@
 """Which errors of a log are independent of one another: those of samples, of pieces, of drives, or of places.
 
-Residuals of a drive are autocorrelated: the usual (J^T J)^-1 understates errors several times. Trials are independent:
-the variance is that of their sums. Where too few trials inform a parameter, or differ less than their pieces do, blocks
-are pieces, and errors no less than those of independent samples. What replicates share is
-no noise but what the model gets wrong about a manoeuvre: where they share more than by chance, manoeuvres are the
-blocks. Errors may be shared at a place of drives alone, where wheels break away: pieces of a manoeuvre, replicates
-together, are blocks of a further kind.
-
-The widest of several estimates exceeds the truth by chance: 90 % intervals hold in 95. How much narrower they may be is
-found by a wild bootstrap (signs of whole blocks at random), for every kind of blocks; what needs the widest intervals
-counts. Source: Cameron, Gelbach and Miller (2008).
-
-Variances: gradients are added within a block before they are squared, and each block's residual is divided by the root
-of what the fit leaves of independent errors, I - H_gg (CR2, unbiased for those). Few blocks know their own variance
-badly: its degrees of freedom are Satterthwaite's. Source: Bell and McCaffrey (2002); Pustejovsky and Tipton (2018).
+Variances are sums within blocks before they are squared (CR2), with Satterthwaite's degrees of freedom. Sources: Bell
+and McCaffrey (2002); Pustejovsky and Tipton (2018). Blocks are trials; pieces, where too few trials inform a parameter;
+manoeuvres, where replicates share more than by chance; and places of manoeuvres. The widest of the intervals is taken,
+and a wild bootstrap corrects for that choice. Source: Cameron, Gelbach and Miller (2008).
 """
 
 from __future__ import annotations
@@ -65,8 +55,7 @@ def sandwich(blocks: np.ndarray, inverse: np.ndarray) -> Sandwich:
 
 
 CONFIDENCE = 0.90
-ENOUGH = 2.0
-"""Degrees of freedom from which the variance between blocks is taken: three or four drives that inform of one."""
+ENOUGH = 2.0  # degrees of freedom from which the variance between blocks is taken: three or four drives that inform
 CHANCE = 0.05  # probability below which what replicates share is taken for the model's error
 FLIPS, AT_ONCE = 999, 2**22  # draws of the signs of blocks; numbers that are drawn together
 
@@ -83,8 +72,7 @@ class Information:
     variance: float  # of residuals
     precision: np.ndarray  # (P, P) of what is known besides
     share: float  # variance that the precision is stated for
-    ahead: np.ndarray = field(default_factory=lambda: np.ones((2, 1)))
-    """(2, P) how many times as wide the intervals would be from their lower and upper ends."""
+    ahead: np.ndarray = field(default_factory=lambda: np.ones((2, 1)))  # (2, P) widths from their lower and upper ends
 
     @property
     def inverse(self) -> np.ndarray:
@@ -151,11 +139,11 @@ def errors_of(evidence: Information, confidence: float = CONFIDENCE) -> Standard
 
 
 def shared_error(series: np.ndarray, groups: np.ndarray) -> float:
-    """Probability that residuals (B, K) of independent trials of one group (B,) are so much alike; 1 without such a
+    """Probability that residuals (B, K) of independent trials of a group (B,) are so much alike; 1 without such a
     group.
 
-    Independent trials might as well have had the opposite errors: their products with one another are compared with
-    those for random signs of the trials. Each trial's residuals are in its own frame.
+    Their products with one another are compared with those for random signs of the trials. Each trial's residuals are
+    in its own frame.
     """
     alike = (groups[:, None] == groups) & ~np.eye(len(groups), dtype=bool)
     if not alike.any():

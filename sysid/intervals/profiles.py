@@ -1,8 +1,7 @@
 """Profile likelihoods: how well a log knows one parameter when all others make the best of each of its values.
 
-A profile follows walls, valleys and saturation, may be one-sided, and shows where a parameter is free of the data. Its
-increase is divided by what the sandwich variance exceeds that of independent residuals by: near its minimum it agrees
-with `sysid.intervals.uncertainty`. Source of the scaling: Rotnitzky and Jewell (1990).
+Their increase is divided by what the sandwich variance exceeds that of independent residuals by (Rotnitzky and Jewell
+1990).
 """
 
 from __future__ import annotations
@@ -33,8 +32,7 @@ class Profile:
     cost: np.ndarray  # (G,) mean squared residual, the other parameters at their best
     statistic: np.ndarray  # (G,) 0 at the best; twice the loss of log likelihood
     threshold: float  # of the statistic at the confidence level
-    interval: tuple[float | None, float | None]
-    """Where the statistic crosses the threshold; None where it does not within the grid."""
+    interval: tuple[float | None, float | None]  # where the statistic crosses the threshold, if it does
     others: np.ndarray  # (G, P) values of all parameters
     fitted: float  # value where the fit had ended
 
@@ -54,23 +52,14 @@ class Profile:
         return ", ".join(ends)
 
 
-@dataclass(frozen=True)
-class Minimum:
-    """Where a fit ended."""
-
-    u: np.ndarray  # (P,) unit coordinates
-    known: Uncertainty
-    """Intervals there, which set a grid's reach; a parameter that is not determined gets its whole range."""
-    robust: bool = False  # it is the minimum of the Huber loss
-
-
 def profile(
-    objective: DriveResiduals, at: Minimum, names: Sequence[str], *, points: int = POINTS, iterations: int = ITERATIONS,
+    objective: DriveResiduals, known: Uncertainty, names: Sequence[str], robust: bool = False, *, points: int = POINTS,
     progress: Progress | None = None,
 ) -> list[Profile]:
     """Profile likelihoods of `names` at the fitted point, all `points` of a grid searched together; ValueError where a
-    name is not searched."""
-    space, u, known, robust = objective.space, at.u, at.known, at.robust
+    name is not searched. `known`: intervals there, which set a grid's reach; a parameter that is not determined gets
+    its whole range. `robust`: it is the minimum of the Huber loss."""
+    space, u = objective.space, known.evidence.u
     check_names(space, names)
     sd = np.maximum(known.deviation, 1e-8)
     scale = _scale(objective, u, known, sd)
@@ -86,7 +75,7 @@ def profile(
         slope = known.covariance[:, index] / max(known.covariance[index, index], 1e-16)
         starts = np.clip(space.moved(np.tile(u, (len(grid), 1)), (grid - u[index])[:, None] * slope), 0.0, 1.0)
         starts[:, index] = grid
-        result = least_squares.fit(objective, starts=starts, stop=least_squares.Stopping(iterations), robust=robust,
+        result = least_squares.fit(objective, starts=starts, stop=least_squares.Stopping(ITERATIONS), robust=robust,
                                    frozen=(name,), progress=progress)
         order = np.argsort(result.starts[:, index])
         cost = np.minimum(result.start_costs[order], np.where(np.isclose(grid, u[index], atol=1e-9), best, np.inf))

@@ -1,11 +1,7 @@
 """Confidence intervals of fitted parameters, and which of them the log cannot determine.
 
-Information is summed over pieces of trials; `sysid.intervals.independence` decides which have errors of their own.
-Slopes are averaged over the errors (`sysid.search.slopes`).
-
-A log's information on the height of the mass depends on that height: an estimate that came out where it is large would
-have a narrow interval, whatever the truth is. Such an interval ends where the integral of dx / h(x) is 1, with h a
-straight line through its half-widths at the fit and at its end, as after a variance-stabilising transformation
+What a log shows of the height of the mass depends on that height. Such an interval ends where the integral of dx / h(x)
+is 1, with h a straight line through its half-widths at the fit and at its end: a variance-stabilising transformation
 (Bartlett 1947).
 """
 
@@ -21,13 +17,12 @@ from sysid.errors.space import BENT, HUBER, NUISANCE, TERMS, Space, huber_weight
 from sysid.intervals.independence import CONFIDENCE, Information, errors_of, shared_error
 from sysid.logs.metrics import replicate_groups
 from sysid.search import least_squares
-from sysid.search.slopes import average_slopes, likely, likely_by
+from sysid.search.slopes import average_slopes, likely_by, products
 
 PIECES = 8  # that each trial is cut into
 PASSES = 2  # of averaging slopes: over errors by differences, and by averaged slopes
 PRIOR_SD = UNKNOWN  # standard deviation in unit coordinates of a parameter of which only its bounds are known (uniform)
-UNIDENTIFIABLE = 0.5
-"""Share of the prior's standard deviation above which a parameter counts as not determined by the log."""
+UNIDENTIFIABLE = 0.5  # share of the prior's standard deviation from which a log does not determine a parameter
 WALL = 1e-3  # distance to a bound, in unit coordinates, that counts as being on it
 FOLLOW = 2  # iterations of all others at the end of an interval
 NEAR = 0.25  # share of a half-width below which a bound is too near to look how wide the interval is from there
@@ -80,13 +75,8 @@ def estimate(
 
     `robust`: u minimises the Huber loss: residuals beyond its bend pull with a constant force and add no curvature.
     """
-    return uncertainty_of(evidence_of(objective, u, robust), objective.space, confidence)
-
-
-def evidence_of(objective: DriveResiduals, u: np.ndarray, robust: bool = False) -> Information:
-    """Information of the drives of an objective at the fitted point u (P,); `robust` as of `estimate`."""
     found = _evidence_at(objective, u, robust)
-    return replace(found, ahead=_ahead(objective, found, robust))
+    return uncertainty_of(replace(found, ahead=_ahead(objective, found, robust)), objective.space, confidence)
 
 
 def _ahead(objective: DriveResiduals, found: Information, robust: bool) -> np.ndarray:
@@ -131,7 +121,7 @@ def _evidence_at(objective: DriveResiduals, u: np.ndarray, robust: bool, over: n
         residual, jacobian = (array[0] for array in objective.jacobian(u[None]))  # (B, K), (B, K, P)
         size = float(robust_cost(residual[None], robust)[0]) / objective.counted
         for _ in range(PASSES):
-            residual, jacobian = average_slopes(objective, u, likely(jacobian, size))
+            residual, jacobian = average_slopes(objective, u, likely_by(products(jacobian), size))
     residual, jacobian = (without_prior(objective, one) for one in (residual, jacobian))  # it is no measurement
     bent = jacobian
     if robust:

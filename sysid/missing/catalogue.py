@@ -1,8 +1,7 @@
-"""The hypotheses of the closed loop: which parameters each effect frees, and how large it may be.
+"""The hypotheses of the closed loop, from the cards of the effects (`whill_mjx.effects.card`).
 
-They are made from the cards of the effects (`whill_mjx.effects.card`). Every hypothesis has coordinates q: q = 0
-without the effect, and |q| = 1 at a size that is small but noticeable on a vehicle of this mass and track. The same
-coordinates serve effects that vanish at 0, at 1 and at infinity, and base parameters outside their day-to-day spread.
+Every hypothesis has coordinates q: q = 0 without the effect, and |q| = 1 at a size that is small but noticeable on a
+vehicle of this mass and track. That serves effects that vanish at 0, at 1 and at infinity alike.
 """
 
 from __future__ import annotations
@@ -22,25 +21,19 @@ from whill_mjx.vehicle.types import VehicleParams
 
 PARAMETER = "pose_delay.delay"
 
-OUTSIDE = "outside"
-"""Place of the effects on a pose that is measured from outside."""
-LEVELS = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""Sizes at which one-sided effects are tried; smooth two-sided ones are tried at -1 and 1."""
+OUTSIDE = "outside"  # place of the effects on a pose that is measured from outside
+LEVELS = (0.5, 1.0, 2.0, 4.0, 8.0)  # sizes at which one-sided effects are tried; two-sided ones are at -1 and 1
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """One effect with some of its parameters freed."""
 
-    effect: str
-    """Canonical name."""
+    effect: str  # canonical name
     axes: tuple[Axis, ...]
-    variant: str = ""
-    """Distinguishes the hypotheses of one effect."""
-    kind: str = "effect"
-    """"parameter_shift" where the axes are base parameters of the vehicle."""
-    constants: tuple[tuple[str, float], ...] = ()
-    """Other parameters and the values they take."""
+    variant: str = ""  # distinguishes the hypotheses of one effect
+    kind: str = "effect"  # "parameter_shift" where the axes are base parameters of the vehicle
+    constants: tuple[tuple[str, float], ...] = ()  # other parameters and the values they take
     @property
     def key(self) -> str:
         return f"{self.effect}/{self.variant}" if self.variant else self.effect
@@ -74,23 +67,16 @@ class Hypothesis:
 
 
 def hypotheses(spec: VehicleSpec, params: VehicleParams) -> tuple[Hypothesis, ...]:
-    """All hypotheses for a vehicle, from the cards of the effects that act in a simulated drive.
-
-    Args:
-        spec: sizes scale with its weight, track and speed.
-        params: the base model; hypotheses about parameters it does not have are left out.
-    """
+    """All hypotheses for a vehicle, from the cards of the effects that act in a simulated drive. Sizes scale with the
+    spec's weight, track and speed; those about parameters that the base model `params` does not have are left out."""
     have = frozenset(describe(params))
     kinds = [kind for kind in in_order() if place_of(kind) != OUTSIDE]
     return tuple(one for kind in kinds for one in of_card(kind, Scale(spec, have)))
 
 
 def outside_hypotheses(spec: VehicleSpec, params: VehicleParams, fitted: Collection[str]) -> tuple[Hypothesis, ...]:
-    """Hypotheses about the pose that is measured from outside.
-
-    Args:
-        fitted: parameters that the base fit has freed; a hypothesis about one is two-sided around the fitted value.
-    """
+    """Hypotheses about the pose that is measured from outside; one about parameters that the base fit has freed
+    (`fitted`) is two-sided around the fitted value."""
     scale = Scale(spec, frozenset(describe(params)))
     found = [one for kind in in_order() if place_of(kind) == OUTSIDE for one in of_card(kind, scale)]
     return tuple(_around_fit(one) if {axis.parameter for axis in one.axes} <= set(fitted) else one for one in found)

@@ -5,33 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from sysid.errors.features import CHANNELS
-from sysid.errors.noise import BIN_SHIFT, Whitener, replicate_groups, scatter
+from sysid.errors.noise import BIN_SHIFT, Whitener, courses_of, scatter
 from sysid.errors.space import Space
 from sysid.logs.log import START_NOISE
 from sysid.logs.records import Trial
 from sysid.logs.replicates import course_of, near
 from sysid.missing.evidence import Columns
 
-ASSUMED_DAYS = 4.0
-"""How many days the mean over all hypotheses counts as, beside the days' information on one."""
-EXCESS = 0.06
-"""Standard deviation of a day's excess where reference days do not determine it."""
-
-
-class Binned(Protocol):
-    """Drives in bins: `sysid.missing.drives.Drives`."""
-
-    @property
-    def trials(self) -> tuple[Trial, ...]: ...
-
-    @property
-    def target(self) -> np.ndarray:
-        """(B, K, C) measured features."""
+ASSUMED_DAYS = 4.0  # how many days the mean over all hypotheses counts as, beside the days' information on one
+EXCESS = 0.06  # standard deviation of a day's excess where reference days do not determine it
 
 
 @dataclass(frozen=True)
@@ -48,8 +36,7 @@ class Leftover:
 class Reference:
     """What is known of a vehicle before the drives in question."""
 
-    params: Any
-    """Fitted `VehicleParams`."""
+    params: Any  # fitted `VehicleParams`
     space: Space
     u: np.ndarray  # (P,) fitted unit coordinates
     spread: np.ndarray  # (P, P) covariance of a day's parameters around u
@@ -57,17 +44,12 @@ class Reference:
     whitener: Whitener
     factors: np.ndarray  # (4, C) noise of rough bins beside smooth ones
     leftovers: tuple[Leftover, ...]
-    width: float
-    """Of the bins [s]."""
-    known: bool
-    """False where the drives in question are themselves the only ones: parameters are then free within bounds."""
+    width: float  # of the bins [s]
+    known: bool  # False where there are no other drives: parameters are then free within bounds
     remark: str
-    noise: np.ndarray | float = 1.0
-    """(C,) noise of the drives in question over that of the reference days."""
-    simulated: bool = False
-    """Whether `leftovers` are drawn from what a vehicle file says of its fit: there are no reference days."""
-    blocks: bool = False
-    """Whether the days are blocks of one run."""
+    noise: np.ndarray | float = 1.0  # (C,) noise of the drives in question over that of the reference days
+    simulated: bool = False  # whether `leftovers` are drawn from what a vehicle file says of its fit
+    blocks: bool = False  # whether the days are blocks of one run
 
     @property
     def channels(self) -> int:
@@ -90,10 +72,7 @@ class Reference:
             mine = [one for one in self.leftovers if one.day == number]
             series = np.stack([self.noise_of(one) for one in mine])
             white = self.whitener.flat(series, np.stack([one.mask for one in mine]))
-            courses = np.zeros(len(mine), int)
-            for course, group in enumerate(replicate_groups(tuple(one.trial for one in mine))):
-                courses[group] = course
-            apart.append(scatter(white, courses))
+            apart.append(scatter(white, courses_of([one.trial for one in mine])))
         finite = [one for one in apart if np.isfinite(one)]
         usual = float(np.clip(-np.mean(finite), 0.0, 1.0)) if finite else 0.0
         return usual * float(np.mean(1 / np.square(self.noise)))
@@ -115,8 +94,8 @@ class Reference:
         """The same for drives in which each channel's noise is larger by a factor (C,)."""
         return replace(self, whitener=self.whitener.scaled(factor), noise=self.noise * factor)
 
-    def target_of(self, drives: Binned) -> np.ndarray:
-        """(B, K, C) measured features less what the model is known to leave of such drives."""
+    def target_of(self, drives: Any) -> np.ndarray:
+        """(B, K, C) measured features of `Drives` less what the model is known to leave of such ones."""
         bins = drives.target.shape[1]
         return drives.target - np.stack([self.expected(trial, bins) for trial in drives.trials])
 
@@ -157,18 +136,12 @@ class Wander:
 
     covariance: tuple[np.ndarray, ...]  # (k, k) each
     shapes: tuple[np.ndarray, ...]  # (D, k) each: root mean square 1 in units of that covariance
-    freedom: float
-    """Degrees of freedom that the covariances rest on."""
-    excess: float = EXCESS
-    """Standard deviation from day to day of the squared residual over the noise, less 1."""
-    usual: float = 0.0
-    """What smooth functions that know no physics gain on a reference day, per trial."""
-    usual_size: float = 0.0
-    """Root mean square of it over the days, for a new one; 0 where reference days do not show it."""
-    scatter: float = 0.0
-    """Excess of what a reference day's replicates do not share."""
-    level: float = 1.0
-    """Mean square of the white residual where nothing is missing: less with sensors quieter than on those days."""
+    freedom: float  # degrees of freedom that the covariances rest on
+    excess: float = EXCESS  # standard deviation from day to day of the squared residual over the noise, less 1
+    usual: float = 0.0  # what smooth functions that know no physics gain on a reference day, per trial
+    usual_size: float = 0.0  # root mean square of it over the days, for a new one; 0 where days do not show it
+    scatter: float = 0.0  # excess of what a reference day's replicates do not share
+    level: float = 1.0  # mean square of the white residual where nothing is missing: less with quieter sensors
 
     def unshared(self, residual: np.ndarray, courses: np.ndarray) -> float:
         """Excess that replicates among trials (B,) of white residuals (B, n) do not share, beyond what is usual."""
@@ -196,21 +169,15 @@ class Wander:
 
     def p_excess(self, excess: float) -> float:
         """Probability of so much excess on a day with nothing in it."""
-        from scipy import stats
-
         return float(stats.t.sf(excess / self.excess, self.freedom))
 
     def excess_limit(self, alpha: float) -> float:
         """Excess that a day with nothing in it has with probability alpha."""
-        from scipy import stats
-
         return float(stats.t.isf(alpha, self.freedom)) * self.excess
 
     def smooth_limit(self, alpha: float) -> float:
         """What smooth functions gain per trial on a day with nothing in it with probability alpha; infinite where days
         do not show it."""
-        from scipy import stats
-
         return float(stats.t.isf(alpha, self.freedom)) * self.usual_size if self.usual_size > 0 else float("inf")
 
 

@@ -40,10 +40,8 @@ class Courses:
 
     first: np.ndarray  # (U,) one trial of each course
     of_trial: np.ndarray  # (B,) course of each trial
-    room: tuple[tuple[int, float], ...]
-    """Free parameters that tie the motion to the room or to the session: index and neutral value."""
-    shared: bool
-    """False where a parameter that is not free does so."""
+    room: tuple[tuple[int, float], ...]  # that tie the motion to room or session: index and neutral value
+    shared: bool  # false where a parameter that is not free does so
 
     def repeat(self, values: np.ndarray) -> bool:
         """Whether trials of one course repeat one another with these values (P,)."""
@@ -55,15 +53,19 @@ class Drives:
     """Trials with their features and a compiled replay over named parameters."""
 
     trials: tuple[Trial, ...]
-    names: tuple[str, ...]
+    vehicle: FreeVehicle
     paths: PathReplay
     batch: Batch
     courses: Courses
     measured: Measured
     features: Features
     target: np.ndarray  # (B, K, 5) measured features
-    weight: np.ndarray | None = None
-    """(B, K, 5) weights of the bins where not all have the same noise."""
+    weight: np.ndarray | None = None  # (B, K, 5) weights of the bins where not all have the same noise
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that replays are given."""
+        return self.vehicle.names
 
     @property
     def mask(self) -> np.ndarray:
@@ -154,28 +156,18 @@ class Drives:
     def linearised(self, sets: Callable[[np.ndarray], np.ndarray], u: np.ndarray, sizes: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray]:
         """Features (B, K, 5) at unit coordinates u (P,), and their derivatives (B, K, 5, P) by differences of the given
-        sizes: skidding wheels make motion rough, and over the size of a day's change the mean slope counts.
-
-        `sets` turns unit coordinates (P,) into values of all replayed parameters.
-        """
+        sizes. `sets` turns unit coordinates (P,) into values of all replayed parameters."""
         pairs = Quotients.central(u[None], sizes)
         at, slopes = pairs.along(u[None], lambda points: self.simulate(np.stack([sets(point) for point in points])))
         return at[0], slopes[0]
 
-    def of(self, trials: tuple[Trial, ...], dt: float) -> Drives:
+    def of(self, trials: tuple[Trial, ...]) -> Drives:
         """Other trials through the same compiled replay."""
-        gyro = self.features.gyro is not None
-        trials = trials if gyro else without_gyro(trials)
-        batch, measured = make_batch(trials, dt, RECORD_DT)
-        features = make_features(trials, self.features.width, gyro)
-        courses = _courses(batch, self.courses.room, self.courses.shared)
-        return Drives(trials, self.names, self.paths, batch, courses, measured, features,
-                      features.of(measured))
+        return make_drives(self.vehicle, trials, self.features.width, self.paths, self.features.gyro is not None)
 
 
 def session_times(trials: Sequence[Trial]) -> np.ndarray:
-    """(B,) times of the session at which trials began [s]: replicates are driven round by round, so each began in the
-    middle of the round that its name counts.
+    """(B,) times of the session at which trials began [s]: in the middle of the round of replicates that a name counts.
 
     A name counts rounds where all drives of its manoeuvre have the same commands and are numbered, such as circle_1 to
     circle_3. A date, or the running number of a recording, does not: nan.
@@ -199,13 +191,9 @@ def make_drives(vehicle: FreeVehicle, trials: tuple[Trial, ...], width: float | 
     `gyro`: whether a gyro is a channel; by default where a trial has one.
     """
     if gyro is False:
-        trials = without_gyro(trials)
+        trials = tuple(trial if trial.gyro is None else replace(trial, gyro=None) for trial in trials)
     params, names = vehicle.params, vehicle.names
     batch, measured = make_batch(trials, vehicle.plant.dt, RECORD_DT)
-
-    def with_free(values: Any) -> Any:
-        return set_values(params, names, values)
-
     neutral = {f"{effect.name}.{field}": about.neutral for effect in getattr(params, "effects", ())
                if effect.room_fixed for field, about in parameters_of(effect).items()}
     held = [name for name in neutral if name not in names]
@@ -215,14 +203,9 @@ def make_drives(vehicle: FreeVehicle, trials: tuple[Trial, ...], width: float | 
         room += ((names.index(DRAIN), 0.0),)
     courses = _courses(batch, room, shared)
     features = make_features(trials, bin_width(trials) if width is None else width, gyro)
-    paths = paths or PathReplay(vehicle.plant, with_free, rows_of_call(10 * len(courses.first)))
-    return Drives(trials, names, paths, batch, courses, measured, features,
-                  features.of(measured))
-
-
-def without_gyro(trials: tuple[Trial, ...]) -> tuple[Trial, ...]:
-    """The trials as if they had no gyro."""
-    return tuple(trial if trial.gyro is None else replace(trial, gyro=None) for trial in trials)
+    paths = paths or PathReplay(vehicle.plant, lambda values: set_values(params, names, values),
+                                rows_of_call(10 * len(courses.first)))
+    return Drives(trials, vehicle, paths, batch, courses, measured, features, features.of(measured))
 
 
 def rows_of_call(most: int = CHUNK) -> int:
@@ -232,14 +215,8 @@ def rows_of_call(most: int = CHUNK) -> int:
 
 def _courses(batch: Batch, room: tuple[tuple[int, float], ...], shared: bool) -> Courses:
     """Trials of a batch with the same commands and the same speeds at the start."""
-    command, start = np.asarray(batch.command), np.asarray(batch.start)
-    seen: dict[bytes, int] = {}
-    first: list[int] = []
-    of_trial = []
-    for i in range(len(command)):
-        key = command[i].tobytes() + start[i, 3:].tobytes()
-        if key not in seen:
-            seen[key] = len(first)
-            first.append(i)
-        of_trial.append(seen[key])
+    keys = [command.tobytes() + start[3:].tobytes()
+            for command, start in zip(np.asarray(batch.command), np.asarray(batch.start), strict=True)]
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    first, of_trial = [keys.index(key) for key in numbers], [numbers[key] for key in keys]
     return Courses(np.array(first), np.array(of_trial), room, shared)

@@ -39,8 +39,7 @@ class Evidence:
     moments: np.ndarray  # (B, P + S)
     pool_moments: tuple[np.ndarray, ...]  # per trial (J, P + S) of white noise of J drives like it
     groups: tuple[tuple[int, ...], ...]  # trials of one manoeuvre
-    shared: float = 0.0
-    """Share of a drive's noise that the others of its manoeuvre have as well (`Reference.shared`)."""
+    shared: float = 0.0  # share of a drive's noise that the others of its manoeuvre have as well (`Reference.shared`)
 
 
 def column_layout(hypotheses: Sequence[Hypothesis], offset: int) -> tuple[Columns, ...]:

@@ -13,16 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.errors.features import CHANNELS, GYRO, bin_width, channel_names, make_features
-from sysid.errors.noise import (
-    ROUGH,
-    Whitener,
-    fit_roughness,
-    fit_whitener,
-    replicate_groups,
-    roughness,
-    scatter,
-)
+from sysid.errors.features import CHANNELS, GYRO, Features, bin_width, channel_names, make_features
+from sysid.errors.noise import ROUGH, Whitener, courses_of, fit_roughness, fit_whitener, roughness, scatter
 from sysid.logs.records import Prediction, Trial
 from sysid.replay.records import Measured
 from sysid.replay.rollout import padded
@@ -38,14 +30,11 @@ class Leftovers:
     """Statistics of what a model leaves of drives, in bins of motion."""
 
     drives: int
-    width: float
-    """Of the bins [s]."""
-    measured: tuple[str, ...]
-    """Channels that the drives had."""
+    width: float  # of the bins [s]
+    measured: tuple[str, ...]  # channels that the drives had
     whitener: Whitener
     factors: np.ndarray  # (4, C) noise of rough bins beside smooth ones
-    shared: float
-    """Share of a drive's white leftover that its replicates have as well."""
+    shared: float  # share of a drive's white leftover that its replicates have as well
 
 
 @dataclass(frozen=True)
@@ -81,16 +70,12 @@ class FittedVehicle:
 
     params: Any
     statistics: FitStatistics | None = None
-    kept: bool = True
-    """False where a fit only starts at it."""
+    kept: bool = True  # false where a fit only starts at it
 
 
 def load_fitted(path: Path) -> tuple[VehicleSpec, FittedVehicle]:
-    """The spec of a vehicle file or built-in vehicle, and the vehicle with what a fit knows beside it.
-
-    Raises:
-        ValueError: the vehicle is unknown, or the statistics in its file do not fit it.
-    """
+    """The spec of a vehicle file or built-in vehicle, and the vehicle with what a fit knows beside it; ValueError where
+    the vehicle is unknown, or the statistics in its file do not fit it."""
     spec, params, _ = load_vehicle(path)
     table = load_statistics(path) if path.is_file() else None
     return spec, FittedVehicle(params, None if table is None else _from_table(path, table))
@@ -100,26 +85,21 @@ def statistics_of(
     trials: Sequence[Trial], seen: Sequence[Prediction], track: float, names: Sequence[str], error: np.ndarray,
     covariance: np.ndarray,
 ) -> FitStatistics:
-    """Those of a fit.
-
-    Args:
-        seen: the trials as the fitted vehicle replays them.
-        names: fitted parameters.
-        error: (P,) standard errors in their own units.
-        covariance: (P, P) in unit coordinates.
-    """
-    size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-    return FitStatistics(tuple(names), error, np.clip(covariance / np.outer(size, size), -1.0, 1.0),
-                         leftovers_of(tuple(trials), seen, track))
-
-
-def leftovers_of(trials: tuple[Trial, ...], seen: Sequence[Prediction], track: float) -> Leftovers:
-    """What replays leave of trials."""
-    features = make_features(trials, bin_width(trials))
+    """Those of a fit of the parameters `names`: `seen` are the trials as the fitted vehicle replays them, `error` (P,)
+    standard errors in their own units, `covariance` (P, P) in unit coordinates."""
+    features, size = make_features(tuple(trials), bin_width(trials)), np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     target, at = (features.of(_table(each)) for each in (trials, seen))
-    factors = fit_roughness(target - at, features.mask, roughness(at, features.width, track))
-    mask = features.mask / factors[roughness(at, features.width, track)]
-    return leftovers_in_bins(trials, target - at, mask, features.width, factors)
+    return FitStatistics(tuple(names), error, np.clip(covariance / np.outer(size, size), -1.0, 1.0),
+                         leftovers_of(tuple(trials), target, at, features, track))
+
+
+def leftovers_of(
+    trials: tuple[Trial, ...], target: np.ndarray, at: np.ndarray, features: Features, track: float
+) -> Leftovers:
+    """What replays of trials, as features `at` (B, K, C), leave of the measured ones, `target`."""
+    level = roughness(at, features.width, track)
+    factors = fit_roughness(target - at, features.mask, level)
+    return leftovers_in_bins(trials, target - at, features.mask / factors[level], features.width, factors)
 
 
 def leftovers_in_bins(
@@ -128,22 +108,15 @@ def leftovers_in_bins(
     """Statistics of leftovers (B, K, C) with weights of bins (B, K, C) and noise factors (4, C)."""
     whitener = fit_whitener(series, mask)
     white = whitener.flat(series, mask)
-    courses = np.zeros(len(trials), int)
-    for number, group in enumerate(replicate_groups(trials)):
-        courses[group] = number
-    apart = scatter(white, courses)
+    apart = scatter(white, courses_of(trials))
     measured = tuple(name for c, name in enumerate(channel_names(mask.shape[-1])) if (mask[..., c] > 0).any())
     return Leftovers(len(trials), width, measured, whitener, factors,
                      float(np.clip(-apart, 0.0, 1.0)) if np.isfinite(apart) else 0.0)
 
 
 def drawn(left: Leftovers, mask: np.ndarray, courses: Sequence[int], rng: np.random.Generator) -> np.ndarray:
-    """Series (B, K, C) of drives with such leftovers.
-
-    Args:
-        mask: (B, K, C) weights of the bins.
-        courses: (B,) drives of one course share as much as replicates do.
-    """
+    """Series (B, K, C) of drives with such leftovers and weights of bins `mask` (B, K, C); drives of one course (B,)
+    share as much as replicates do."""
     count = len(courses)
     own, common = (rng.standard_normal((size, *mask.shape[1:])) for size in (count, max(courses) + 1))
     white = np.sqrt(1 - left.shared) * own + np.sqrt(left.shared) * common[list(courses)]

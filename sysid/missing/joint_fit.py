@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,8 +18,7 @@ class Refit:
     hypotheses: tuple[Hypothesis, ...]
     u: np.ndarray  # (P,) base parameters, unit coordinates
     q: np.ndarray  # (k,) coordinates of all hypotheses, one after the other
-    cost: float
-    """Squared white residual plus the prior's term."""
+    cost: float  # squared white residual plus the prior's term
     residual: np.ndarray  # (B, n) white residual
     jacobian: np.ndarray  # (B, n, P + k) of the white features by (u, q)
     values: np.ndarray  # all parameters
@@ -35,13 +34,18 @@ class Refit:
     @property
     def split(self) -> list[np.ndarray]:
         """Coordinates of each hypothesis."""
-        return list(np.split(self.q, np.cumsum([len(one.axes) for one in self.hypotheses])[:-1]))
+        return [self.q[part] for part in self.parts]
 
     @property
     def parts(self) -> list[slice]:
         """Where the coordinates of each hypothesis lie within q."""
-        ends = np.cumsum([0, *(len(one.axes) for one in self.hypotheses)]).tolist()
-        return [slice(start, stop) for start, stop in zip(ends[:-1], ends[1:], strict=True)]
+        return parts_of(self.hypotheses)
+
+
+def parts_of(hypotheses: Sequence[Hypothesis]) -> list[slice]:
+    """Where the coordinates of each of some hypotheses lie, one after the other."""
+    ends = np.cumsum([0, *(len(one.axes) for one in hypotheses)]).tolist()
+    return [slice(start, stop) for start, stop in pairwise(ends)]
 
 
 def moved_last(fit: Refit, number: int) -> Refit:
@@ -67,23 +71,3 @@ class Start:
     def at(cls, refit: Refit) -> Start:
         """Where a fit ended."""
         return cls(refit.hypotheses, refit.u, refit.q, refit.jacobian[..., : len(refit.u)])
-
-
-class Replays(Protocol):
-    """What a fit was made with: `sysid.missing.refit.Refitter`."""
-
-    drives: Any
-    reference: Any
-    precision: np.ndarray
-
-    def white(self, series: np.ndarray) -> np.ndarray:
-        """White and flat features."""
-
-    def values_at(self, hypotheses: Sequence[Hypothesis], u: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """All parameters at base coordinates u (P,) and the hypotheses' own q (k,)."""
-
-
-def without_each(fit: Refit, refitter: Replays) -> list[np.ndarray]:
-    """All parameters of a joint fit without one effect, for each of them."""
-    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u, np.delete(fit.q, part))
-            for i, part in enumerate(fit.parts)]

@@ -40,18 +40,15 @@ class PoseReplay:
         return Quotients.central(values, self.steps, -np.inf, np.inf).along(values, self.simulate)
 
 
-SEARCHES, WORTH = 6, 1e-3
-"""One after the other at most, and the share of the cost that one must gain for another to follow."""
-POOLED = 1.0
-"""Degrees of freedom that the noise of all replicates counts as, beside those of a manoeuvre's own."""
+SEARCHES, WORTH = 6, 1e-3  # searches at most, and the share of the cost that one must gain for another to follow
+POOLED = 1.0  # degrees of freedom that the noise of all replicates counts as, beside those of a manoeuvre's own
 
 
 def by_own_noise(trials: Sequence[Trial], measured: Measured) -> Measured:
     """The measurements with masks that weigh each trial by what replicates of its manoeuvre differ by.
 
-    Replicates that skid part by ten times as much as others. With one noise for all, the fit would follow their chance
-    and leave the others to errors that are small beside it. Few replicates say little: their variance is drawn towards
-    that of all. Manoeuvres without any have that one; without replicates nothing changes.
+    Replicates that skid part by ten times as much as others: with one noise for all, the fit would follow their chance.
+    Variances of few replicates are drawn towards that of all, which manoeuvres without any have.
     """
     pooled = replicate_noise(tuple(trials))
     if pooled is None:
@@ -97,14 +94,9 @@ def fit_poses(
 
 def to_its_end(objective: Callable[[np.ndarray], Residuals], u: np.ndarray, iterations: int) -> np.ndarray:
     """Where searches of so many iterations at most end, each begun where the one before ended, until one gains nothing
-    that counts.
+    that counts: costs are jagged, and rounding decides where a single one ends.
 
-    Costs are jagged, so a search ends where its own steps happen to gain nothing, and rounding decides where. The next
-    one has damping and derivatives anew, and what drives do not show of the noise is then what that end leaves.
-
-    Args:
-        objective: around unit coordinates (P,).
-        u: (P,) where the first search begins.
+    `objective`: around unit coordinates (P,), with the noise that is left there; `u`: (P,) where the first one begins.
     """
     for _ in range(SEARCHES):
         found = least_squares.fit(objective(u), starts=u[None], stop=least_squares.Stopping(iterations))

@@ -4,43 +4,40 @@ does not reproduce, and the noise."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.features import GYRO, bin_width, channel_names
 from sysid.errors.noise import (
+    Whitener,
+    courses_of,
     first_scales,
     fit_roughness,
     fit_whitener,
     replicate_groups,
     roughness,
 )
-from sysid.errors.prior import EXPECTED, expected_sd
+from sysid.errors.prior import EXPECTED, LEAST, SPREAD, UNKNOWN, expected_sd
 from sysid.errors.space import Space, make_space
 from sysid.logs.records import Log, Trial
-from sysid.missing.base_fit import BaseFit
 from sysid.missing.days import Leftover, Reference, difference_sizes, expected_without
 from sysid.missing.drives import Drives, make_drives
-from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_in_bins
+from sysid.missing.fit_statistics import FittedVehicle, Leftovers, drawn, leftovers_of
 from sysid.replay.records import FreeVehicle, Plant
+from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try
 from sysid.search.result import Progress
+from whill_mjx.io.steps import step
 from whill_mjx.vehicle.parameters import set_values
 
-ASSUMED_SPREAD = 0.05
-"""Day-to-day standard deviation of a parameter, as a share of its value, where reference drives do not show it."""
-ASSUMED_DAYS = 4.0
-"""How many days of reference drives that assumption counts as."""
-LEAST_SPREAD = 0.003  # of the range: what no parameter is known better than
-OWN_ITERATIONS = 30
-"""Of the base fit to the drives of one day, at most: near the fit to all days it ends by itself after a few. Fits to
-blocks of a long run that are cut short would differ by less than they should."""
-WEAK_PRIOR = 0.29  # of the range: standard deviation of a parameter of which only its bounds are known
-BLOCK = "block"
-"""Field of a log that is one part of a long run."""
-LEAST_DRAWN = 24
-"""Drives that are simulated, at least, to show the noise that a vehicle file states."""
+ASSUMED_DAYS = 4.0  # how many days of reference drives that assumption counts as
+OWN_ITERATIONS = 30  # of the base fit to one day, at most: days whose fits are cut short would differ by too little
+BLOCK = "block"  # field of a log that is one part of a long run
+LEAST_DRAWN = 24  # drives that are simulated, at least, to show the noise that a vehicle file states
+CHOICES = tuple(Try(factor) for factor in (0.1, 1.0, 10.0, 100.0))
+PATIENCE = Patience(tolerance=1e-3, first=3)
 
 
 def make_reference(
@@ -79,7 +76,7 @@ def make_reference(
         prior = (u, np.diag(1 / (3 * assumed_spread(space, u)) ** 2))
         for number, log in enumerate(logs):
             index = np.flatnonzero(day == number)
-            one = drives.of(log.training, vehicle.plant.dt)
+            one = drives.of(log.training)
             one = one.weighted(one.simulate(space.to_values(u)[None])[0], factors, spec.track)
             own = BaseFit(one, space, whitener, sizes).run(u, OWN_ITERATIONS, prior, progress)
             days[number] = own - u
@@ -106,19 +103,18 @@ def of_vehicle(
 ) -> Reference:
     """A vehicle that was fitted before, without drives of it: nothing of the log in question is taken for known.
 
-    Spread and noise are those of its fit. Reference drives that stand for the noise are drawn from them, and have no
-    course in common with drives in question: nothing is subtracted from these. Where the file says nothing of its fit,
-    the noise is assumed to be what a fit of the log's own leaves.
+    Spread and noise are those of its fit, or where the file says nothing of it, of a fit to the log itself. Reference
+    drives that stand for the noise are drawn from them, and have no course in common with drives in question.
     """
     params, known = vehicle.params, vehicle.statistics
     space = make_space(params, log.spec, names)
     u = space.to_unit(space.initial)
     assumed = np.diag(assumed_spread(space, u) ** 2)
-    remark = f"one vehicle file: parameters are assumed to vary by {ASSUMED_SPREAD:.0%} of their values from day to day"
+    remark = f"one vehicle file: parameters are assumed to vary by {SPREAD:.0%} of their values from day to day"
     spread = assumed
     if known is not None:
         errors = known.covariance(space.names, space.slope(u))
-        spread = assumed + _within(errors, WEAK_PRIOR)
+        spread = assumed + _within(errors, UNKNOWN)
         remark += ", beside the standard errors of its fit; how far effects seem to wander is assumed"
     width = bin_width(log.training) if known is None else known.leftovers.width
     gyro = None if known is None else GYRO in known.leftovers.measured
@@ -148,18 +144,13 @@ def _own_leftovers(drives: Drives, space: Space, u: np.ndarray, log: Log, progre
     prior = (u, np.diag(1 / (3 * spread) ** 2))
     own = BaseFit(drives, space, whitener, difference_sizes(np.diag(spread**2))).run(u, OWN_ITERATIONS, prior, progress)
     at = drives.simulate(space.to_values(own)[None])[0]
-    level = roughness(at, drives.features.width, log.spec.track)
-    factors = fit_roughness(drives.target - at, drives.mask, level)
-    return leftovers_in_bins(log.training, drives.target - at, drives.mask / factors[level], drives.features.width,
-                             factors)
+    return leftovers_of(log.training, drives.target, at, drives.features, log.spec.track)
 
 
 def _drawn(trials: tuple[Trial, ...], mask: np.ndarray, left: Leftovers) -> tuple[Leftover, ...]:
     """Leftovers of simulated drives with the commands of trials, whose manoeuvres nobody drove."""
     times = -(-LEAST_DRAWN // len(trials))
-    courses = np.zeros(len(trials), int)
-    for number, group in enumerate(replicate_groups(trials)):
-        courses[group] = number
+    courses = courses_of(trials)
     every = np.concatenate([courses + k * (courses.max() + 1) for k in range(times)])
     series = drawn(left, np.tile(mask, (times, 1, 1)), every.tolist(), np.random.default_rng(0))
     return tuple(Leftover(replace(trials[i % len(trials)], manoeuvre=f"simulated/{every[i]}"), 0, one,
@@ -191,7 +182,7 @@ def assumed_spread(space: Space, u: np.ndarray) -> np.ndarray:
     scale = np.where(value > 0, value, space.high - space.low)
     sizes = [EXPECTED.get(name, one) for name, one in zip(space.names, scale, strict=True)]
     scale = np.where(_of_gyro(space), scale, sizes)
-    spread = np.clip(ASSUMED_SPREAD * scale / np.maximum(space.slope(u), 1e-12), LEAST_SPREAD, WEAK_PRIOR)
+    spread = np.clip(SPREAD * scale / np.maximum(space.slope(u), 1e-12), LEAST, UNKNOWN)
     return np.where(_of_gyro(space), np.minimum(spread, expected_sd(space)), spread)
 
 
@@ -203,15 +194,55 @@ def _of_gyro(space: Space) -> np.ndarray:
 def _spread(space: Space, u: np.ndarray, days: np.ndarray, known: bool) -> tuple[np.ndarray, str]:
     """Covariance of a new day's parameters and what it rests on."""
     if not known:
-        return np.diag(np.where(_of_gyro(space), expected_sd(space), WEAK_PRIOR) ** 2), (
+        return np.diag(np.where(_of_gyro(space), expected_sd(space), UNKNOWN) ** 2), (
             "no reference drives: base parameters are free, so effects that they imitate (mass, track, scrub, "
             "friction, drag, traction) cannot be seen")
     assumed = np.diag(assumed_spread(space, u) ** 2)
     if len(days) < 2:
-        return assumed, (f"one reference day: parameters are assumed to vary by {ASSUMED_SPREAD:.0%} of their values "
+        return assumed, (f"one reference day: parameters are assumed to vary by {SPREAD:.0%} of their values "
                          "from day to day")
     centred = days - days.mean(0)
     covariance = centred.T @ centred
     count = len(days) - 1
     mixed = (ASSUMED_DAYS * assumed + covariance) / (ASSUMED_DAYS + count) * (1 + 1 / len(days))
-    return mixed, f"day-to-day spread from {len(days)} reference days, with {ASSUMED_SPREAD:.0%} of the values as prior"
+    return mixed, f"day-to-day spread from {len(days)} reference days, with {SPREAD:.0%} of the values as prior"
+
+
+@dataclass(frozen=True)
+class BaseFit:
+    """Fits of the base model to drives: they minimise |W (f(u) - y)|^2 over the unit box."""
+
+    drives: Drives  # replays over exactly the parameters of `space`
+    space: Space
+    whitener: Whitener
+    sizes: np.ndarray  # (P,) unit coordinates, over which derivatives are taken: what a day changes smooths skids out
+
+    def run(
+        self, start: np.ndarray, iterations: int, prior: tuple[np.ndarray, np.ndarray] | None = None,
+        progress: Progress | None = None,
+    ) -> np.ndarray:
+        """The best unit coordinates (P,), from a start (P,). `prior`: their mean (P,) and precision (P, P)."""
+        solver = GaussNewton(BoxStep(passes=1), CHOICES, PATIENCE, prior)
+        state, measured = solver.init(start[None]), float((self.drives.mask > 0).sum())
+        for _ in range(iterations):
+            state = State(*step("base fit", partial(self._advanced, solver, state), *state))
+            if progress is not None:
+                progress(1, f"base fit, cost {state.cost[0] / measured:.3f}")
+            if solver.done(state).all():
+                break
+        return np.asarray(state.u[0])
+
+    def _advanced(self, solver: GaussNewton, state: State) -> State:
+        """After an iteration of a single start."""
+        at, slopes = self.drives.linearised(self.space.to_values, state.u[0], self.sizes)
+        residual = self._white(at[None])
+        jacobian = self.whitener.apply(slopes, self.drives.mask).reshape(1, -1, state.u.shape[1])
+        state = state._replace(cost=solver.cost(residual, state.u))
+        tried = solver.tries(state, *solver.normal(residual, jacobian, state.u))
+        points = tried.points[0]
+        white = self._white(self.drives.simulate(self.space.to_values(points)))
+        return solver.step(state, tried, solver.cost(white, points)[None])
+
+    def _white(self, features: np.ndarray) -> np.ndarray:
+        """White residuals (N, n) of features (N, B, K, C)."""
+        return np.stack([self.whitener.apply(one - self.drives.target, self.drives.mask).ravel() for one in features])

@@ -13,29 +13,28 @@ from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Reference, difference_sizes
 from sysid.missing.drives import Drives
 from sysid.missing.evidence import with_values
-from sysid.missing.joint_fit import Refit, Start
+from sysid.missing.joint_fit import Refit, Start, parts_of
 from sysid.replay.arrays import Quotients
 from sysid.replay.cores import on_all_cores
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, Try
 from whill_mjx.io.steps import step
 
 CHOICES = (Try(1.0, easing=0.2), Try(1.0, 0.3, easing=0.2), Try(30.0, easing=6.0))
-TOLERANCE = 2e-3
-"""Share of what is left above the noise that a step must bring to go on."""
+TOLERANCE = 2e-3  # share of what is left above the noise that a step must bring to go on
 PROMISE = 0.6
 """Share of the foretold fall of the cost that a step must bring, so that the base parameters' columns are kept."""
-STIFFEST = 1e4
-"""Damping beyond which one small gain ends a fit."""
-REACH = 4.0
-"""Standard deviations of the day-to-day spread that a base parameter may be off. What lies further is an effect."""
-STIFF = 0.25
-"""Share of the day-to-day spread that a fit leaves base parameters which shall hardly move."""
-ITERATIONS = 12
-"""Of a fit, at most."""
-WHITENED = 16
-"""Parameter sets whose features are made white in one call."""
-STEP_Q = 0.08
-"""Difference quotients of a coordinate are taken over this share of its size, or of 1 where it is small."""
+STIFFEST = 1e4  # damping beyond which one small gain ends a fit
+REACH = 4.0  # standard deviations of a day that a base parameter may be off: what lies further is an effect
+STIFF = 0.25  # share of the day-to-day spread that a fit leaves base parameters which shall hardly move
+ITERATIONS = 12  # of a fit, at most
+WHITENED = 16  # parameter sets whose features are made white in one call
+STEP_Q = 0.08  # difference quotients of a coordinate are taken over this share of its size, or of 1 where it is small
+
+
+def without_each(fit: Refit, refitter: Refitter) -> list[np.ndarray]:
+    """All parameters of a joint fit without one effect, for each of them."""
+    return [refitter.values_at((*fit.hypotheses[:i], *fit.hypotheses[i + 1 :]), fit.u, np.delete(fit.q, part))
+            for i, part in enumerate(fit.parts)]
 
 
 def own_sizes(q: np.ndarray) -> np.ndarray:
@@ -46,8 +45,7 @@ def own_sizes(q: np.ndarray) -> np.ndarray:
 class Refitter:
     """Refits on one set of drives. The base Jacobian is kept from the reference: a day moves it by percents."""
 
-    renews = True
-    """Whether the base Jacobian is renewed where a step did not bring what it promised."""
+    renews = True  # whether the base Jacobian is renewed where a step did not bring what it promised
 
     def __init__(self, drives: Drives, reference: Reference, values: np.ndarray, slopes: np.ndarray):
         """`values` (all parameters) at the reference; `slopes` (B, K, C, P) there."""
@@ -107,10 +105,10 @@ class Refitter:
     def run(self, start: Start, iterations: int) -> Generator[np.ndarray, np.ndarray, Refit]:
         """One fit: yields parameter sets (N, all), is sent their white features (N, B, n).
 
-        The coordinates' columns are renewed in every iteration, those of the base parameters only where a step did not
-        bring what they promised: a day moves them by percents, and they are the dearer ones. A fit that has come to
-        rest begins again from there, damped as at first and with all columns anew, as long as that promises to gain
-        what counts and the way since the last beginning did: where it rests depends on rounding.
+        The coordinates' columns are renewed in every iteration, those of the base parameters, which are dearer, only
+        where a step did not bring what they promised. A fit that has come to rest begins again from there, damped as at
+        first and with all columns anew, as long as that promises to gain what counts and the way since the last
+        beginning did.
         """
         found, size = start.hypotheses, len(start.u)
         solver = self._solver(found)
@@ -206,12 +204,9 @@ class Refitter:
         """All parameters at base coordinates u (P,) and the hypotheses' own q (k,)."""
         values = self.values.copy()
         values[self.base_index] = self.reference.space.to_values(u)
-        start = 0
-        for one in hypotheses:
+        for one, part in zip(hypotheses, parts_of(hypotheses), strict=True):
             base = dict(zip(self.names, values.tolist(), strict=True))  # two may move the same parameter
-            part = q[start : start + len(one.axes)]
-            values = with_values(values, self.names, one.values(part, base))
-            start += len(one.axes)
+            values = with_values(values, self.names, one.values(q[part], base))
         return values
 
 

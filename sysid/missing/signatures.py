@@ -9,10 +9,10 @@ import numpy as np
 
 from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
-from sysid.missing.catalogue import LEVELS, Hypothesis, base_values
+from sysid.missing.catalogue import Axis, Hypothesis, base_values
 from sysid.missing.days import Leftover, Reference, alike, difference_sizes
 from sysid.missing.drives import Drives
-from sysid.missing.evidence import Columns, Evidence, with_values
+from sysid.missing.evidence import Evidence, column_layout, with_values
 from sysid.search.result import Progress
 from whill_mjx.io.steps import step
 from whill_mjx.vehicle.types import VehicleParams
@@ -40,46 +40,40 @@ def _simulated(drives: Drives, sets: np.ndarray) -> list[np.ndarray]:
 def signature_columns(
     drives: Drives, hypotheses: Sequence[Hypothesis], values: np.ndarray, names: Sequence[str], at: np.ndarray,
     progress: Progress | None = None,
-) -> tuple[np.ndarray, list[Columns]]:
-    """(B, K, C, S) change of the features per unit of each coordinate, and which column is which.
+) -> np.ndarray:
+    """(B, K, C, S) change of the features per unit of each coordinate, in the order of `column_layout`.
 
     Two-sided axes: central differences at 1. One-sided: the change at each level, per unit; of those that only change
     what the others do, against the others alone.
     """
     base = dict(zip(names, values.tolist(), strict=True))
     sets: list[np.ndarray] = []
-    jobs: list[tuple[int, float, int, float]] = []
-    for number, one in enumerate(hypotheses):
-        for level in ((1.0,) if one.signed else LEVELS):
-            for position, axis in enumerate(one.axes):
-                q = np.zeros(len(one.axes))
-                if axis.dependent:
-                    q[one.main] = level
-                top = 1.0 if axis.signed else min(level, axis.limit)
-                bottom = -1.0 if axis.signed else 0.0
-                for size in (top, bottom) if axis.signed or axis.dependent else (top,):
-                    q[position] = size
-                    sets.append(with_values(values, names, one.values(q, base)))
-                jobs.append((number, level, position, top - bottom))
+    jobs: list[tuple[Axis, bool, float]] = []
+    for columns in column_layout(hypotheses, 0):
+        one = hypotheses[columns.hypothesis]
+        for position, axis in enumerate(one.axes):
+            q, pair = np.zeros(len(one.axes)), axis.signed or axis.dependent
+            if axis.dependent:
+                q[one.main] = columns.level
+            top = 1.0 if axis.signed else min(columns.level, axis.limit)
+            bottom = -1.0 if axis.signed else 0.0
+            for size in (top, bottom) if pair else (top,):
+                q[position] = size
+                sets.append(with_values(values, names, one.values(q, base)))
+            jobs.append((axis, pair, top - bottom))
     seen = []
     for part in np.array_split(np.stack(sets), min(PARTS, len(sets))):
         seen += step("signatures", partial(_simulated, drives, part), part)
         if progress is not None:
             progress(1, "signatures")
-    flat, cursor = np.concatenate(seen), 0
-    parts, columns = [], []
-    for number, level, position, span in jobs:
-        axis = hypotheses[number].axes[position]
-        pair = axis.signed or axis.dependent
+    flat, cursor, parts = np.concatenate(seen), 0, []
+    for axis, pair, span in jobs:
         change = flat[cursor] - (flat[cursor + 1] if pair else at)
         if axis.dependent and np.abs(change).max() < UNSEEN * np.abs(flat[cursor] - at).max():
             change = flat[cursor] - at  # nothing separates the two here: not a column of its own
         parts.append(change / span)
         cursor += 2 if pair else 1
-        if position == 0:
-            columns.append(Columns(number, level, ()))
-        columns[-1] = Columns(number, level, (*columns[-1].index, len(parts) - 1))
-    return np.stack(parts, axis=-1), columns
+    return np.stack(parts, axis=-1)
 
 
 def gather(
@@ -95,20 +89,16 @@ def gather(
     values = np.array([base[name] for name in names])
     at = drives.simulate(values[None])[0]
     slopes = base_columns(drives, reference, values, names)
-    signatures, columns = signature_columns(drives, hypotheses, values, names, at, progress)
+    signatures = signature_columns(drives, hypotheses, values, names, at, progress)
     white = reference.whitener
-    residual = white.apply(reference.target_of(drives) - at, drives.mask)
-    design = white.apply(np.concatenate([slopes, signatures], axis=-1), drives.mask)
-    count, size = len(residual), residual[0].size
-    residual, design = residual.reshape(count, size), design.reshape(count, size, -1)
-    pool = [_pool(reference, trial, drives.mask[i]) for i, trial in enumerate(drives.trials)] if pools else []
+    residual = white.flat(reference.target_of(drives) - at, drives.mask)
+    design = white.flat(np.concatenate([slopes, signatures], axis=-1), drives.mask)
     offset = reference.space.size
-    placed = tuple(Columns(c.hypothesis, c.level, tuple(offset + i for i in c.index)) for c in columns)
     evidence = Evidence(
-        residual, design, offset, placed, np.linalg.inv(reference.spread),
+        residual, design, offset, column_layout(hypotheses, offset), np.linalg.inv(reference.spread),
         np.einsum("bni,bnj->bij", design, design, optimize=True), np.einsum("bni,bn->bi", design, residual),
-        tuple(noise @ design[i] for i, noise in enumerate(pool)), manoeuvre_groups(drives.trials),
-        reference.shared)
+        tuple(_pool(reference, trial, drives.mask[i]) @ design[i] for i, trial in enumerate(drives.trials) if pools),
+        manoeuvre_groups(drives.trials), reference.shared)
     return evidence, slopes
 
 

@@ -17,8 +17,7 @@ from sysid.errors.features import CHANNELS
 from sysid.logs.records import Trial, command_in_force
 
 TERMS = 8  # smooth functions of one quantity
-MEMORY = (0.5, 2.0)
-"""Time constants [s] of what the motion remembers: a controller answers a force for a second or two."""
+MEMORY = (0.5, 2.0)  # time constants [s] of what the motion remembers: a controller answers a force for a second or two
 WAVES = 2  # harmonics of an angle
 PHASES = np.arange(24) * 2 * np.pi / 24  # start angles of a wheel that are tried
 ANGLE_PRICE = 4.0  # what fitting its start angle brings a trial in noise; taken off
@@ -115,15 +114,13 @@ def _rolled(trial: Trial, t: np.ndarray, track: float) -> np.ndarray:
 
 def align(products: np.ndarray, moments: np.ndarray, turns: np.ndarray, penalty: np.ndarray
           ) -> tuple[np.ndarray, np.ndarray]:
-    """One shape for many drives, each of them turned by an angle of its own.
+    """One shape for many drives, each turned by an angle of its own: coefficients (F, C), and the turn (B,) of each
+    drive.
 
     Args:
         products: (B, F, F) of each drive's columns; moments: (B, F, C) of its columns with the residual.
         turns: (G, F, F) what coefficients become when the angle starts elsewhere; one identity for no freedom.
         penalty: (F, F) prior of the coefficients.
-
-    Returns:
-        Coefficients (F, C), and for each drive the number of its turn (B,).
     """
     best: tuple[float, np.ndarray, np.ndarray] | None = None
     alone = [np.linalg.solve(a + penalty, b) for a, b in zip(products, moments, strict=True)]

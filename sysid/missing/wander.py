@@ -23,8 +23,7 @@ from sysid.search.result import Progress
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
-ASSUMED = 0.3
-"""Standard deviation of a coordinate from day to day where reference days do not determine it."""
+ASSUMED = 0.3  # standard deviation of a coordinate from day to day where reference days do not determine it
 
 
 def estimate(
@@ -81,10 +80,8 @@ def coordinates(evidence: Evidence, trials: Sequence[int] | np.ndarray) -> list[
 
 
 def _pooled(columns: Sequence[Columns], days: Sequence[list[tuple[np.ndarray, np.ndarray]]]) -> Wander:
-    """Covariances beyond the noise, each drawn towards what all hypotheses have in common.
-
-    A day with little information on an effect, because its drives hardly excite it, counts for little.
-    """
+    """Covariances beyond the noise, each drawn towards what all hypotheses have in common; days count by their
+    information on an effect."""
     ratios = [float(q @ information @ q) / len(q) for day in days for q, information in day]
     common = max(float(np.median(ratios)) / 0.455, 1.0)  # 0.455: median of chi squared with one degree of freedom
     covariance, shapes = [], []

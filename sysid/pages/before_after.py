@@ -3,73 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sysid.logs.records import OdometryStream, PoseStream, Prediction, Trial
+from sysid.pages.series import TrialSeries
 from whill_mjx.io.html import charts, legend, table
 from whill_mjx.io.svg import Axes, Line, line_chart
 
 POINTS = 240  # of a drawn path
 SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
-DRAWN = ("#b2182b", "#e08214", "#1f6fb4")
-"""Colours of the replays, worst first."""
+DRAWN = ("#b2182b", "#e08214", "#1f6fb4")  # colours of the replays, worst first
 MEASURED = "#111111"
 DASHES = ("2 3", "6 3", "")
 CHANNEL_WORDS = {"ground_truth": "as tracked from outside", "odometry": "as its own odometry reports it"}
 
 
-@dataclass(frozen=True)
-class Paths:
-    """Where one drive went, and where replays of it went; x, y [m], yaw [rad]."""
-
-    name: str
-    held_out: bool
-    channel: str
-    t: np.ndarray  # (T,) s
-    measured: np.ndarray  # (T, 3)
-    replays: dict[str, np.ndarray]  # replay -> (T, 3)
-
-
-def replayed_paths(trials: Sequence[Trial], replays: Mapping[str, Sequence[Prediction]]) -> list[Paths]:
-    """Paths of trials whose position was measured: of the outside pose, else of the odometry."""
-    found = []
-    for k, trial in enumerate(trials):
-        channel = next((name for name in CHANNEL_WORDS if _path(trial, name) is not None), None)
-        if channel is not None:
-            paths = {name: path for name, each in replays.items() if (path := _path(each[k], channel)) is not None}
-            measured = _path(trial, channel)
-            assert measured is not None
-            found.append(Paths(trial.name, trial.held_out, channel, getattr(trial, channel).t, measured, paths))
-    return found
-
-
-def shown_drive(drives: Sequence[Paths]) -> dict[str, Any] | None:
+def shown_drive(series: Sequence[TrialSeries]) -> dict[str, Any] | None:
     """The drive that a report shows: of the held-out ones (else of all) that of the median position error in the first
-    replay, so that it is neither the best nor the worst.
+    replay, so that it is neither the best nor the worst. By the outside pose, or else by the odometry.
 
     Returns:
         `trial`, `held_out`, `channel`, `t` (T,) [s], and `measured` and each replay as (T, 3) x, y [m], yaw [rad], at
         most POINTS rows; `errors`: replay -> `position`, `largest`, `end` [m] and `yaw` [rad]. None without a drive.
     """
-    held = [one for one in drives if one.held_out]
-    among = sorted(held or drives, key=lambda one: _errors(one.measured, next(iter(one.replays.values())))["position"])
+    drives = [(trial, channel) for trial in series if (channel := _placed(trial)) is not None]
+    held = [(trial, channel) for trial, channel in drives if trial.held_out]
+
+    def errors(trial: TrialSeries, channel: str) -> dict[str, dict[str, float]]:
+        paths = {name: values[:, :3] for name, values in trial.channels[channel].values.items()}
+        return {name: _errors(paths["measured"], path) for name, path in paths.items() if name != "measured"}
+
+    among = sorted(held or drives, key=lambda one: next(iter(errors(*one).values()))["position"])
     if not among:
         return None
-    one = among[(len(among) - 1) // 2]
-    every = np.unique(np.linspace(0, len(one.t) - 1, min(len(one.t), POINTS)).astype(int))
-    return {"trial": one.name, "held_out": one.held_out, "channel": one.channel, "t": one.t[every],
-            "measured": one.measured[every], **{name: path[every] for name, path in one.replays.items()},
-            "errors": {name: _errors(one.measured, path) for name, path in one.replays.items()}}
+    one, channel = among[(len(among) - 1) // 2]
+    t = one.channels[channel].t
+    every = np.unique(np.linspace(0, len(t) - 1, min(len(t), POINTS)).astype(int))
+    return {"trial": one.name, "held_out": one.held_out, "channel": channel, "t": t[every],
+            **{name: path[every, :3] for name, path in one.channels[channel].values.items()},
+            "errors": errors(one, channel)}
 
 
 def drive_pictures(shown: Mapping[str, Any], names: Mapping[str, str]) -> str:
-    """Path, position error over time and heading error over time of the drive that is shown.
-
-    `names`: replay -> what it is called, worst first.
-    """
+    """Path, and errors of position and heading over time, of the drive that is shown; `names`: replay -> what it is
+    called, worst first."""
     t, measured = np.asarray(shown["t"], float), np.asarray(shown["measured"], float)
     replays = {name: np.asarray(shown[name], float) for name in names}
     style = {name: (DRAWN[k + len(DRAWN) - len(names)], DASHES[k + len(DRAWN) - len(names)])
@@ -100,12 +78,10 @@ def drive_table(shown: Mapping[str, Any], names: Mapping[str, str]) -> str:
                   "heading usually off by [degrees]"], rows, "\"usually\": root mean square over the drive")
 
 
-def _path(source: Trial | Prediction, channel: str) -> np.ndarray | None:
-    """(T, 3) x, y, yaw of a channel; None where it has no position."""
-    stream: PoseStream | OdometryStream | None = getattr(source, channel)
-    if stream is None or stream.x is None or stream.y is None or stream.yaw is None:
-        return None
-    return np.column_stack([stream.x, stream.y, stream.yaw])
+def _placed(trial: TrialSeries) -> str | None:
+    """The channel in which the position of a trial was measured."""
+    return next((name for name in CHANNEL_WORDS if name in trial.channels and np.isfinite(
+        trial.channels[name].values["measured"][:, :3]).all()), None)
 
 
 def _off(measured: np.ndarray, replayed: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.logs.records import CHANNEL_NAMES, CHECK
-from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
-from sysid.pages.series import Channel, TrialSeries
+from sysid.pages.before_after import drive_pictures, drive_table, shown_drive
+from sysid.pages.series import REPLAYED, Channel, TrialSeries
 from whill_mjx.io.html import (
     Cell,
     Section,
@@ -53,15 +53,13 @@ def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[
 
 def choose(series: Sequence[TrialSeries]) -> list[TrialSeries]:
     """At most MAX_TRIALS, held-out ones first, each manoeuvre before its repetitions."""
-    order = sorted(range(len(series)), key=lambda i: (not series[i].held_out, _repetition(series[i].name), i))
-    held_out = [i for i in order if series[i].held_out][: MAX_TRIALS // 2 + 2]
-    rest = [i for i in order if not series[i].held_out]
-    return [series[i] for i in held_out + rest[: MAX_TRIALS - len(held_out)]]
+    def repetition(trial: TrialSeries) -> int:
+        tail = trial.name.rsplit("_", 1)[-1]
+        return int(tail) if tail.isdigit() else 0
 
-
-def _repetition(name: str) -> int:
-    tail = name.rsplit("_", 1)[-1]
-    return int(tail) if tail.isdigit() else 0
+    order = sorted(series, key=repetition)
+    held_out = [trial for trial in order if trial.held_out][: MAX_TRIALS // 2 + 2]
+    return held_out + [trial for trial in order if not trial.held_out][: MAX_TRIALS - len(held_out)]
 
 
 def summary(report: dict[str, Any], series: Sequence[TrialSeries]) -> str:
@@ -71,7 +69,7 @@ def summary(report: dict[str, Any], series: Sequence[TrialSeries]) -> str:
     notes = dataset.get("notes") or []
     parts = [paragraph(" ".join(lead(report)[1:])), *(paragraph(f"{note[0].upper()}{note[1:].rstrip('.')}.")
                                                           for note in notes if _is_limit(note))]
-    shown = shown_drive(series_paths(series, list(REPLAY_WORDS)))
+    shown = shown_drive(series)
     if shown is not None:
         parts += [drive_pictures(shown, REPLAY_WORDS), drive_table(shown, REPLAY_WORDS)]
     parts.append(paragraph(f"Dataset {dataset['name']}, vehicle {dataset['vehicle']}: {len(dataset['training'])} "
@@ -109,19 +107,6 @@ def lead(report: dict[str, Any]) -> list[str]:
     return [headline(report), second, third]
 
 
-def series_paths(series: Sequence[TrialSeries], replays: Sequence[str]) -> list[Paths]:
-    """Paths of trials of a fit whose position was measured."""
-    found = []
-    for trial in series:
-        channel = next((name for name in CHANNEL_NAMES if name in trial.channels and np.isfinite(
-            trial.channels[name].values["measured"][:, :3]).all()), None)
-        if channel is not None:
-            one = trial.channels[channel]
-            found.append(Paths(trial.name, trial.held_out, channel, one.t, one.values["measured"][:, :3],
-                               {name: one.values[name][:, :3] for name in replays}))
-    return found
-
-
 def _is_limit(note: str) -> bool:
     """Whether a note says what the log does not determine, or what is wrong with it."""
     return note.startswith(("not fitted", "the log has no commands", CHECK))
@@ -134,10 +119,8 @@ def _spoken(name: str) -> str:
 
 
 def warning(report: dict[str, Any]) -> str:
-    """A sentence where held-out drives are predicted worse than by what the fit began with; nothing otherwise.
-
-    What is below the floor, the spread of replicates, is no worse: nothing shows there.
-    """
+    """A sentence where held-out drives are predicted worse than by what the fit began with, and than the floor, the
+    spread of replicates; nothing otherwise."""
     channels = report["summary"]["held_out"]
     channel = "ground_truth" if "trajectory" in channels.get("ground_truth", {}) else "odometry"
     for metric, spoken in (("trajectory", _cm), ("yaw", _degrees)):
@@ -279,23 +262,33 @@ def profiles(report: dict[str, Any]) -> str:
 
 def trajectories(drawn: Sequence[TrialSeries]) -> str:
     """Paths of the outside pose, or of the odometry without one."""
-    items = [line_chart([replay_line(values[:, 0], values[:, 1], name) for name, values in channel.values.items()],
-                        "x [m]", "y [m]", _label(trial), Axes(equal=True, smallest=SMALLEST))
-             for trial in drawn if (channel := _position_channel(trial)) is not None]
-    return _replay_legend() + charts(items, "Measured and replayed paths; all replays start at the measured start "
-                                            "pose. Held-out trials first.")
+    items = [path_chart(channel, trial.label) for trial in drawn
+             if (channel := _position_channel(trial)) is not None]
+    return replay_legend() + charts(items, "Measured and replayed paths; all replays start at the measured start "
+                                           "pose. Held-out trials first.")
 
 
 def yaws(drawn: Sequence[TrialSeries]) -> str:
     """Yaw over time of the same trials."""
-    items = [line_chart([replay_line(channel.t, values[:, 2], name) for name, values in channel.values.items()],
-                        "t [s]", "yaw [rad]", _label(trial), Axes(smallest=0.05))
-             for trial in drawn if (channel := _position_channel(trial)) is not None]
-    return _replay_legend() + charts(items)
+    return replay_legend() + charts([yaw_chart(channel, trial.label) for trial in drawn
+                                     if (channel := _position_channel(trial)) is not None])
 
 
-def _replay_legend() -> str:
-    return legend([(name, COLOURS[name]) for name in ("measured", *REPLAYS)])
+def path_chart(channel: Channel, title: str, replays: Sequence[str] = REPLAYED) -> str:
+    """Paths of a channel as measured and replayed."""
+    return line_chart([replay_line(channel.values[name][:, 0], channel.values[name][:, 1], name) for name in replays],
+                      "x [m]", "y [m]", title, Axes(equal=True, smallest=SMALLEST))
+
+
+def yaw_chart(channel: Channel, title: str, replays: Sequence[str] = REPLAYED) -> str:
+    """Yaw of a channel over time, as measured and replayed."""
+    return line_chart([replay_line(channel.t, channel.values[name][:, 2], name) for name in replays], "t [s]",
+                      "yaw [rad]", title, Axes(smallest=0.05))
+
+
+def replay_legend(replays: Sequence[str] = REPLAYED) -> str:
+    """Colours of what was measured and of replays."""
+    return legend([(name, COLOURS[name]) for name in replays])
 
 
 def residuals(series: Sequence[TrialSeries], drawn: Sequence[TrialSeries]) -> str:
@@ -313,7 +306,7 @@ def residuals(series: Sequence[TrialSeries], drawn: Sequence[TrialSeries]) -> st
                      for k, (one, error) in enumerate(found) if np.isfinite(error[:, column]).any()]
             if lines:
                 items.append(line_chart(lines, "t [s]", name, f"residual {name}", Axes(smallest=1e-4)))
-        parts += [legend([(_label(trial), PALETTE[k % len(PALETTE)]) for k, trial in enumerate(mine)]), charts(items),
+        parts += [legend([(trial.label, PALETTE[k % len(PALETTE)]) for k, trial in enumerate(mine)]), charts(items),
                   heading(f"{CHANNEL_NAMES[channel].capitalize()}: autocorrelation of the residual about zero"),
                   legend([("training trials", PALETTE[0]), ("held-out trials", PALETTE[1])]),
                   charts(_autocorrelations(series, channel), "White noise would lie in the band for 95% of the lags.")]
@@ -444,10 +437,6 @@ def _position_channel(trial: TrialSeries) -> Channel | None:
         if channel is not None and np.isfinite(channel.values["measured"][:, :3]).any():
             return channel
     return None
-
-
-def _label(trial: TrialSeries) -> str:
-    return trial.name + (" (held out)" if trial.held_out else "")
 
 
 def _is_more(value: float | None, reference: float | None) -> bool:

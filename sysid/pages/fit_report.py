@@ -20,6 +20,7 @@ from sysid.logs.measured import load_any
 from sysid.logs.metrics import score
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.fit_statistics import statistics_of
+from sysid.pages.plots import write_plots
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
 from sysid.pages.series import collect, save
 from sysid.replay.models import Model, Twin, describe_parameters, get_parameters, save_model
@@ -31,6 +32,7 @@ from sysid.search.settings import FitConfig
 from sysid.search.studies import without_secrets
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.vehicle_file import save_vehicle
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,6 @@ def fit_dataset(
         quick: overrides `config.quick` where true.
         model: as of `fit_log`.
     """
-    from sysid.pages.plots import write_plots
-    from whill_mjx.vehicle.vehicle_file import save_vehicle
-
     config = config or FitConfig()
     config = replace(config, quick=quick or config.quick)
     data = path if isinstance(path, Loaded) else Loaded(load_any(path), path)
@@ -147,8 +146,8 @@ def fit_dataset(
         _save_twin(out, twin, fit, log, replays[: len(log.training)], provenance(report))
         report["dataset"]["notes"].append(_twin_note(log, replays, fitted))
     write_report(out / "report.json", report)
-    write_plots(out, trials, initial, fitted, rows)
     series = collect(trials, initial, fitted)
+    write_plots(out, series, rows)
     save(out, series)
     write_html(out, series)
     intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
@@ -172,8 +171,6 @@ def _twin_replays(twin: Twin, trials: tuple[Trial, ...], physics_dt: float, fram
 def _save_twin(out: Path, twin: Twin, fit: Fit, log: Log, replays: Sequence[Prediction], origin: dict[str, Any]
                ) -> None:
     """Write the vehicle that drives as a fitted model does, with what its `replays` leave of the training trials."""
-    from whill_mjx.vehicle.vehicle_file import save_vehicle
-
     known = [k for k, name in enumerate(fit.space.names) if name in twin.shared]
     meaning = [twin.shared[fit.space.names[k]] for k in known]
     factors = np.array([factor for _, factor, _ in meaning])
@@ -216,11 +213,8 @@ UNKNOWN = ("Without an outside pose this log does not separate errors of wheel r
 def calibration_notes(
     estimates: Sequence[Estimate], spec: VehicleSpec, trials: Sequence[Trial], kept: Sequence[str] = ()
 ) -> list[str]:
-    """Sentences on radius, track, the odometry's scales and the tracked point; those that a log leaves open are
-    named.
-
-    `kept`: groups that keep their stated values (`sysid.search.stated`).
-    """
+    """Sentences on radius, track, the odometry's scales and the tracked point, also on what a log leaves open, and on
+    groups that keep their stated values (`sysid.search.stated`)."""
     notes = _notes(estimates, spec, trials)
     if kept:
         notes.append(f"Stated values are kept for {', '.join(kept)}: free ones did not predict held-back drives "
@@ -231,12 +225,8 @@ def calibration_notes(
 def effective_track(drives: Sequence[Prediction | Trial], track: float, scale: float = 1.0) -> float | None:
     """Track [m] of a robot on two wheels that turns as far by the same wheel speeds; None where no drive turns.
 
-    The odometry's yaw over that of the outside pose, times the track that it takes.
-
-    Args:
-        drives: with both.
-        track: of the odometry [m].
-        scale: of the odometry's yaw over that of its wheels.
+    The odometry's yaw over that of the outside pose, times the `track` that it takes [m]; `scale`: of the odometry's
+    yaw over that of its wheels.
     """
     along, turned, samples = 0.0, 0.0, 0
     for drive in drives:

@@ -10,7 +10,8 @@ import numpy as np
 
 from sysid.logs.records import Log
 from sysid.logs.streams import speeds
-from whill_mjx.io.folders import whole_file, write_whole
+from sysid.pages.plots import pyplot, save
+from whill_mjx.io.folders import write_whole
 from whill_mjx.io.html import Cell, Section, bullets, html_page, paragraph, png, table
 
 MAX_ROWS = 60  # trials listed one by one
@@ -108,13 +109,8 @@ MARKS = ("o", "x")  # marks of the quantities of one unit
 
 def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     """Write the picture (PNG) of a log and what `sysid.logs.inspection.inspect` found on it."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     rows = max(len(found["replicates"]), 3)
-    figure = pyplot.figure(figsize=(12.0, 8.5 + 0.25 * rows), layout="constrained")
+    figure = pyplot().figure(figsize=(12.0, 8.5 + 0.25 * rows), layout="constrained")
     parts: Any = figure.subfigures(3, 1, height_ratios=(4.2, 3.3, 1.0 + 0.25 * rows))
     upper, middle, lower = parts
     left, right = upper.subplots(1, 2)
@@ -124,10 +120,7 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     lower.suptitle("Standard deviation between replicates: no model can predict better", fontsize=11)
     _spread(lower.subplots(1, len(UNITS), sharey=True), found)
     figure.suptitle(f"{log.name}: {len(log.trials)} trials, {found['log']['seconds']:.0f} s")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=100)
-    pyplot.close(figure)
-    return path
+    return save(figure, path, 100)
 
 
 def _label(axis: Any, title: str, across: str, up: str) -> None:

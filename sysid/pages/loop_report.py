@@ -25,17 +25,30 @@ from sysid.logs.records import Prediction, Trial
 from sysid.missing.catalogue import Hypothesis, base_values, falsifiers
 from sysid.missing.days import Reference
 from sysid.missing.unexplained import held_back_gains
-from sysid.pages.before_after import replayed_paths, shown_drive
-from sysid.pages.loop_errors import change, replay, table
-from sysid.pages.loop_evidence import base_table, evidence_for, form_curves, in_range
-from sysid.pages.loop_power import detectable, new_days, operating
+from sysid.pages.before_after import shown_drive
+from sysid.pages.loop_page import write_method, write_page
+from sysid.pages.loop_tables import (
+    base_table,
+    change,
+    detectable,
+    evidence_for,
+    form_curves,
+    in_range,
+    new_days,
+    operating,
+    replay,
+    table,
+)
 from sysid.pages.loop_words import shifts, summary
-from sysid.pages.report import code_hashes, error_rows
+from sysid.pages.report import code_hashes, error_rows, write_report
+from sysid.pages.series import replayed
 from sysid.pages.verdict_picture import account
+from sysid.verdict.posterior import write as write_evidence
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import fitted_after, fitted_alone, fitted_before
 from whill_mjx.effects import EFFECTS, about_of, equation
 from whill_mjx.vehicle.parameters import describe
+from whill_mjx.vehicle.vehicle_file import save_vehicle
 
 WRITING = "fitting the vehicle to whole poses, without and with what was found, and writing the report"
 """What `write_result` does, for who waits for it."""
@@ -77,7 +90,7 @@ def make_report(result: Result) -> dict[str, Any]:
         "effects": effects(result) if found.verdict == "named" else [],
         "before": table(rows, trials, "initial"), "refitted": table(refitted_rows, trials, "fitted"),
         "after": table(rows, trials, "fitted"),
-        "shown": shown_drive(replayed_paths(trials, {"before": before, "refitted": refitted, "after": after})),
+        "shown": shown_drive(replayed(trials, {"before": before, "refitted": refitted, "after": after})),
         "alone": alone(result, trials, before), "change": change(rows),
         "by_manoeuvre": by_manoeuvre(trials, before, after),
         "worse": worse(by_manoeuvre(trials, refitted, after)), "operating": operating(result, days),
@@ -108,26 +121,24 @@ def effects(result: Result) -> list[dict[str, Any]]:
     base, was = base_values(result.full), base_values(result.reference.params)
     for index, name in enumerate(result.reference.space.names):
         base[name] = float(result.reference.space.to_values(final.u)[index])
-    kept = {one.hypothesis.key for one in found.accepted}
-    out, start = [], 0
-    for one in final.hypotheses:
-        stop = start + len(one.axes)
-        ends = [one.values(np.clip(edge, [-a.limit if a.signed else 0.0 for a in one.axes], None), base)
-                for edge in (low[start:stop], high[start:stop])]
+    kept = {one.hypothesis.key: (one, alike) for one, alike in zip(found.accepted, found.classes, strict=True)}
+    out = []
+    for one, part in zip(final.hypotheses, final.parts, strict=True):
+        ends = [one.values(np.clip(edge[part], [-a.limit if a.signed else 0.0 for a in one.axes], None), base)
+                for edge in (low, high)]
         if one.key in kept:
-            index = [c.hypothesis.key for c in found.accepted].index(one.key)
+            named, alike = kept[one.key]
             out.append({
-                "name": one.effect, "kind": one.kind, "variant": one.variant, "class": found.classes[index],
+                "name": one.effect, "kind": one.kind, "variant": one.variant, "class": alike,
                 "parameters": {axis.parameter: {
                     "value": values[axis.parameter],
                     **in_range(axis.parameter, values[axis.parameter], [end[axis.parameter] for end in ends]),
                     "confidence": trust.CONFIDENCE, "unit": about_of(axis.parameter).unit,
                     "was": was.get(axis.parameter), "neutral": about_of(axis.parameter).neutral,
                     "description": about_of(axis.parameter).description} for axis in one.axes},
-                "p_value": found.accepted[index].p,
+                "p_value": named.p,
                 "equation": equation(EFFECTS[one.effect]) if one.effect in EFFECTS else "",
-                "evidence": evidence_for(result, slice(start, stop), one.effect)})
-        start = stop
+                "evidence": evidence_for(result, part, one.effect)})
     return out
 
 
@@ -184,11 +195,6 @@ def pairs_of(result: Result, most: int = 5) -> list[dict[str, Any]]:
 
 def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
     """Write report.json, both pages, vehicle.toml and, where one is proposed, next_command.csv into a folder."""
-    from sysid.pages.loop_page import write_method, write_page
-    from sysid.pages.report import write_report
-    from sysid.verdict.posterior import write as write_evidence
-    from whill_mjx.vehicle.vehicle_file import save_vehicle
-
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     unnamed = report["unnamed"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sysid.logs.manoeuvre_library import make_command
@@ -137,9 +137,7 @@ def sentence(proposal: Mapping[str, Any]) -> str:
 
 def command_of(proposal: Mapping[str, Any]) -> Command:
     """The commands of a proposal."""
-    parameters = proposal["parameters"]
-    return make_command(proposal["name"], parameters["v"], parameters["omega"], parameters["seconds"],
-                        parameters["dt"])
+    return make_command(proposal["name"], **proposal["parameters"])
 
 
 def describe_unnamed(one: Mapping[str, Any]) -> str:
@@ -172,7 +170,7 @@ def _found(report: Mapping[str, Any]) -> str:
     if report["verdict"] == "none" and untold(report):
         return ("Nothing shows how much of the error is noise: no drive was repeated, and there is no reference. "
                 "Whether anything without a name is missing is unknown.")
-    far = sorted((row for row in report.get("base", ()) if abs(row["away"]) > FAR), key=lambda row: -abs(row["away"]))
+    far = _far(report.get("base", ()))
     if report["verdict"] == "none" and another_floor(report):
         return "These drives differ from the reference as on another floor; no effect stands out beside that."
     if report["verdict"] == "none" and report.get("known", True) and far:
@@ -231,11 +229,14 @@ def _digits(low: float, high: float) -> int:
     return min(max(1 - math.floor(math.log10(width)), 0), 6) if width > 0 else 3
 
 
-def shifts(rows: list[dict[str, Any]], least: float = FAR) -> list[str]:
-    """Base parameters that the last refit moved by more than so many day-to-day spreads, in words, furthest first."""
-    far = sorted((row for row in rows if abs(row["away"]) > least), key=lambda row: -abs(row["away"]))
+def shifts(rows: list[dict[str, Any]]) -> list[str]:
+    """Base parameters that the last refit moved by more than `FAR` day-to-day spreads, in words, furthest first."""
     return [f"{row['name']} {row['reference']:.4g} -> {row['after']:.4g} {row['unit']} ({row['away']:+.1f} spreads)"
-            for row in far]
+            for row in _far(rows)]
+
+
+def _far(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    return sorted((row for row in rows if abs(row["away"]) > FAR), key=lambda row: -abs(row["away"]))
 
 
 def summary(report: dict[str, Any], width: int = 100) -> str:

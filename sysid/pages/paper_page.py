@@ -12,13 +12,15 @@ import numpy as np
 from sysid.intervals.statistics import holm, mean_sd, sign_flip_p, smallest_p
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.logs.records import Log
+from sysid.pages.fit_page import WORSE, path_chart, replay_legend, yaw_chart
+from sysid.pages.plots import write_paper_figures
 from sysid.pages.report import write_report
 from sysid.pages.series import TrialSeries, save
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
-from whill_mjx.io.html import Cell, Section, charts, html_page, legend, paragraph, png, table
-from whill_mjx.io.svg import COLOURS, Axes, line_chart, replay_line
+from whill_mjx.io.html import Cell, Section, charts, html_page, paragraph, png, table
 from whill_mjx.logs.dataset import write_text
 from whill_mjx.logs.manoeuvres import PAPER_MANOEUVRES
+from whill_mjx.vehicle.vehicle_file import save_vehicle
 
 PARAMETERS = (
     "lateral_damping.c_rear", "lateral_damping.c_front", "forward_slip.eta", "pid_drive.kp", "pid_drive.ki",
@@ -28,7 +30,7 @@ PARAMETERS = (
 HELD_OUT = "figure_eight"
 TRAJECTORY_FIGURES, YAW_FIGURES = ("s_curve", "figure_eight"), ("turn", "circle")
 SIGNIFICANT = 0.05
-WORSE = 1.001  # times as much counts as more than before
+REPLAYS = ("measured", "initial", "fitted")
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,6 @@ def caution(content: dict[str, Any]) -> str:
 
 def write(folder: Path, content: dict[str, Any], fit: Any, series: Sequence[TrialSeries], log: Log) -> None:
     """Write paper.json, paper.md, figures, paper.html, series.npz and vehicle.toml."""
-    from sysid.pages.plots import write_paper_figures
-    from whill_mjx.vehicle.vehicle_file import save_vehicle
-
     folder.mkdir(parents=True, exist_ok=True)
     write_report(folder / "paper.json", content)
     write_text(folder / "paper.md", markdown(content) + "\n" + caution(content) + "\n")
@@ -142,21 +141,13 @@ def sections(content: dict[str, Any], series: Sequence[TrialSeries], figures: Se
         [one["name"], one["unit"], one["initial"], one["optimised"], one["published"]]
         for one in content["parameters"]])
     drawn = [trial for trial in series if trial.name.rsplit("_", 1)[-1] == "1"] or list(series)[:6]
-    paths, yaws = [], []
-    for trial in drawn:
-        channel_of = trial.channels.get(content["settings"]["channel"])
-        if channel_of is None:
-            continue
-        replays = {name: channel_of.values[name] for name in ("measured", "initial", "fitted")}
-        title = trial.name + (" (held out)" if trial.held_out else "")
-        paths.append(line_chart([replay_line(one[:, 0], one[:, 1], name) for name, one in replays.items()], "x [m]",
-                                "y [m]", title, Axes(equal=True, smallest=0.3)))
-        yaws.append(line_chart([replay_line(channel_of.t, one[:, 2], name) for name, one in replays.items()], "t [s]",
-                               "yaw [rad]", title, Axes(smallest=0.05)))
-    key = legend([(name, COLOURS[name]) for name in ("measured", "initial", "fitted")])
+    shown = [(one, trial.label, REPLAYS) for trial in drawn
+             if (one := trial.channels.get(content["settings"]["channel"])) is not None]
+    key = replay_legend(REPLAYS)
     return [Section("Table", "".join(parts)), Section("Parameters", values + paragraph(
         "The paper's values are of another vehicle; they stand here for orientation.", "dim")),
-        Section("Trajectories", key + charts(paths)), Section("Yaw over time", key + charts(yaws)),
+        Section("Trajectories", key + charts([path_chart(*one) for one in shown])),
+        Section("Yaw over time", key + charts([yaw_chart(*one) for one in shown])),
         Section("Figures for print", "".join(png(path) for path in figures)),
         Section("Data and code", table(["", ""], [["dataset SHA-256", content["dataset"]["sha256"]],
                                                   *([name, value] for name, value in content["code"].items())]))]

@@ -8,16 +8,24 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from sysid.logs.measured import load_any
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.logs.records import Prediction, Trial
-from sysid.pages.series import TrialSeries
+from sysid.pages.fit_page import fit_sections, headline
+from sysid.pages.series import FILE, TrialSeries, collect, load
+from sysid.replay.rollout import Replay, make_batch, predictions, vehicle_plant
 from whill_mjx.io.fields import Field, check_table, shown
 from whill_mjx.io.formats import upgraded
-from whill_mjx.io.html import Section
+from whill_mjx.io.html import Section, html_page
 from whill_mjx.io.reading import read_json
 from whill_mjx.logs.dataset import write_text
+from whill_mjx.vehicle.config import VehicleConfig
+from whill_mjx.vehicle.parameters import set_values
+from whill_mjx.vehicle.vehicle_file import load_vehicle
 
 SCHEMA = 1
 KIND = "sysid-report"
@@ -95,14 +103,8 @@ def read_report(run: Path) -> dict[str, Any]:
 
 
 def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections: Sequence[Section] = ()) -> Path:
-    """Write RUN/report.html from RUN/report.json, self-contained, with more `sections` first.
-
-    `series`: motion of the trials; by default RUN/series.npz, or else the trials are replayed from the dataset.
-    """
-    from sysid.pages.fit_page import fit_sections, headline
-    from sysid.pages.series import FILE, load, replay
-    from whill_mjx.io.html import html_page
-
+    """Write RUN/report.html from RUN/report.json, self-contained, with more `sections` first. `series`: motion of the
+    trials; by default RUN/series.npz, or else the trials are replayed from the dataset."""
     run = Path(run)
     report = read_report(run)
     if series is None:
@@ -116,6 +118,27 @@ def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections:
                          f"{str(error)[:160]}). {AGAIN}") from error
     write_text(run / "report.html", page)
     return run / "report.html"
+
+
+def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
+    """Series of a run folder without the file: replays of its dataset by the vehicle before and after the fit.
+    FileNotFoundError or ValueError where the dataset has moved or changed since."""
+    dataset = report["dataset"]
+    log = load_any(dataset["path"], train=tuple(dataset.get("train") or ()),
+                   held_out=tuple(dataset.get("held_out_selection") or ()))
+    if log.sha256 != dataset["sha256"]:
+        raise ValueError(f"{dataset['path']}: has changed since {run / 'report.json'} was written (SHA-256 "
+                         f"{log.sha256[:12]}, then {dataset['sha256'][:12]}). Fit it again.")
+    spec, params, _ = load_vehicle(run / "vehicle.toml")
+    plant = vehicle_plant(spec, VehicleConfig(physics_dt=report["settings"].get("physics_dt", 0.005)))
+    names = [one["name"] for one in report["parameters"]]
+    trials = (*log.training, *log.held_out)
+    batch, _ = make_batch(trials, plant.dt)
+    replayed = Replay(plant, batch, lambda values: set_values(params, names, values)).simulate(
+        np.array([[one[key] for one in report["parameters"]] for key in ("initial", "value")], float))
+    before, after = (predictions(trials, jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf)[k], replayed))
+                     for k in (0, 1))
+    return collect(trials, before, after)
 
 
 def code_hashes() -> dict[str, str]:

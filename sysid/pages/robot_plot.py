@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from sysid.pages.plots import pyplot, save
 from sysid.replay.robot import Robot
 
 DRIVEN, FLOOR, REST = "#d95f02", "#1b9e77", "#bbbbbb"
@@ -15,14 +16,9 @@ AROUND = 32  # points of a rim
 
 def write_robot(path: Path, robot: Robot, loads: dict[str, float]) -> None:
     """Write a PNG: driven wheels, what else stands on the floor, and the rest of the shapes that may touch."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     host, data, joints = robot.host, robot.resting, robot.joints
     wheels = {int(host.body_weldid[host.jnt_bodyid[joint]]) for joint in joints}
-    figure, axes = plt.subplots(1, 2, figsize=(10, 5), constrained_layout=True)
+    figure, axes = pyplot().subplots(1, 2, figsize=(10, 5), constrained_layout=True)
     for geom in range(host.ngeom):
         if host.geom_bodyid[geom] == 0 or not host.geom_contype[geom] | host.geom_conaffinity[geom]:
             continue
@@ -44,8 +40,7 @@ def write_robot(path: Path, robot: Robot, loads: dict[str, float]) -> None:
     axes[1].set(title="from the side", xlabel="x [m]", ylabel="z [m]", aspect="equal")
     axes[1].axhline(float(data.geom_xpos[_floor(host), 2]), color="k", lw=0.8)
     figure.suptitle(f"{robot.path.name}: driven wheels orange, other supports green")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save(figure, path, 110)
 
 
 def _floor(host: mujoco.MjModel) -> int:

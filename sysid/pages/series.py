@@ -7,7 +7,7 @@ outside pose (T, 3) and x, y, yaw, v, omega of the odometry (T, 5); columns that
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ class Channel:
     """One channel of one trial."""
 
     t: np.ndarray  # (T,) s
-    values: dict[str, np.ndarray]  # "measured", "ideal", "initial", "fitted" -> (T, 3) or (T, 5)
+    values: dict[str, np.ndarray]  # "measured" and the names of replays -> (T, 3) or (T, 5)
 
     def error(self, replay: str = "fitted") -> np.ndarray:
         """Replayed minus measured (T, C); position along and left of the measured heading, yaw as an angle."""
@@ -52,20 +52,25 @@ class TrialSeries:
     start: tuple[float, float, float]  # x, y [m], yaw [rad] in the room
     channels: dict[str, Channel]
 
+    @property
+    def label(self) -> str:
+        """Its name, and whether it was held out."""
+        return self.name + (" (held out)" if self.held_out else "")
 
-def collect(
-    trials: Sequence[Trial], initial: Sequence[Prediction], fitted: Sequence[Prediction]
-) -> list[TrialSeries]:
-    """Series of trials and their two replays."""
+
+def collect(trials: Sequence[Trial], initial: Sequence[Prediction], fitted: Sequence[Prediction]) -> list[TrialSeries]:
+    """Series of trials and their three replays."""
+    return replayed(trials, {"ideal": list(map(ideal_replay, trials)), "initial": initial, "fitted": fitted})
+
+
+def replayed(trials: Sequence[Trial], replays: Mapping[str, Sequence[Prediction]]) -> list[TrialSeries]:
+    """Series of trials as measured and as replayed."""
     found = []
-    for trial, before, after in zip(trials, initial, fitted, strict=True):
-        sources = {"measured": trial, "ideal": ideal_replay(trial), "initial": before, "fitted": after}
-        channels = {}
-        for channel in CHANNELS:
-            stream = getattr(trial, channel)
-            if stream is not None:
-                channels[channel] = Channel(stream.t, {name: getattr(source, channel).values
-                                                       for name, source in sources.items()})
+    for number, trial in enumerate(trials):
+        sources = {"measured": trial, **{name: each[number] for name, each in replays.items()}}
+        channels = {channel: Channel(getattr(trial, channel).t, {name: getattr(source, channel).values
+                                                                 for name, source in sources.items()})
+                    for channel in CHANNELS if getattr(trial, channel) is not None}
         start = trial.start.x, trial.start.y, trial.start.yaw
         found.append(TrialSeries(trial.name, trial.held_out, start, channels))
     return found
@@ -116,35 +121,3 @@ def _trial_series(path: Path, arrays: dict[str, np.ndarray], index: str, about: 
         channels[name] = Channel(t, {replay: table.astype(float) for replay, table in values.items()})
     x, y, yaw = (float(value) for value in about["start"])
     return TrialSeries(str(about["name"]), bool(about["held_out"]), (x, y, yaw), channels)
-
-
-def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
-    """Series of a run folder without the file: load its dataset and replay the vehicle before and after the fit.
-
-    FileNotFoundError or ValueError where the dataset has moved or changed since the fit.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from sysid.logs.measured import load_any
-    from sysid.replay.rollout import Replay, make_batch, predictions, vehicle_plant
-    from whill_mjx.vehicle.config import VehicleConfig
-    from whill_mjx.vehicle.parameters import set_values
-    from whill_mjx.vehicle.vehicle_file import load_vehicle
-
-    dataset = report["dataset"]
-    log = load_any(dataset["path"], train=tuple(dataset.get("train") or ()),
-                   held_out=tuple(dataset.get("held_out_selection") or ()))
-    if log.sha256 != dataset["sha256"]:
-        raise ValueError(f"{dataset['path']}: has changed since {run / 'report.json'} was written (SHA-256 "
-                         f"{log.sha256[:12]}, then {dataset['sha256'][:12]}). Fit it again.")
-    spec, params, _ = load_vehicle(run / "vehicle.toml")
-    plant = vehicle_plant(spec, VehicleConfig(physics_dt=report["settings"].get("physics_dt", 0.005)))
-    names = [one["name"] for one in report["parameters"]]
-    trials = (*log.training, *log.held_out)
-    batch, _ = make_batch(trials, plant.dt)
-    replayed = Replay(plant, batch, lambda values: set_values(params, names, values)).simulate(
-        np.array([[one[key] for one in report["parameters"]] for key in ("initial", "value")], float))
-    before, after = (predictions(trials, jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf)[k], replayed))
-                     for k in (0, 1))
-    return collect(trials, before, after)

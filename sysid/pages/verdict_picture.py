@@ -18,12 +18,10 @@ BLUE, GREY, RED = "#1f6fb4", "#b4b4b4", "#b2182b"
 
 
 def account(findings: Findings, priors: Thresholds) -> dict[str, Any]:
-    """What `draw` shows of a verdict; part of report.json.
+    """What `draw` shows of a verdict: part of report.json.
 
-    Returns:
-        `verdict`; `looks`: p-value of each look at the drives; `alpha` and `least_share`, what they are held against;
-        `explanations`: `name`, `share` that it explains, posterior `weight` and the `outcome` of each. Those of
-        nothing and of something unknown have no share.
+    `looks`: p-value of each look at the drives; `alpha` and `least_share`, what they are held against;
+    `explanations`: `name`, `share` that it explains, posterior `weight` and `outcome` of each.
     """
     judged = posterior(findings, priors)
     looks = {"one effect stands out": findings.p_scan, "two effects stand out": findings.p_pairs,

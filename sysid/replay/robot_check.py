@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 
 from sysid.replay.robot import Robot
 from sysid.replay.robot_contacts import radius_of
-from sysid.replay.robot_drive import RAMP, SECONDS, SPIN, RobotDrive
+from sysid.replay.robot_drive import SECONDS, SPIN, from_rest
 from sysid.replay.robot_rest import FALLS
 
 DRAGS = 0.3  # friction of what slides on the floor: a ball or a skid of plastic has less
@@ -43,14 +42,8 @@ def check_robot(robot: Robot) -> Check:
     """Drive a robot straight on and on the spot, each from rest."""
     v = SPIN * robot.wheel_radius
     omega = 2 * v / robot.track / (1 if len(robot.wheels) == 2 else 2)
-    steps, second = round(SECONDS / robot.host.opt.timestep), round(1 / robot.host.opt.timestep)
-    commands = np.zeros((1, 2, steps, 2))
-    ramp = np.minimum(np.arange(1, steps + 1) * robot.host.opt.timestep / RAMP, 1.0)
-    commands[0, 0, :, 0], commands[0, 1, :, 1] = v * ramp, omega * ramp
-    rest = np.tile(robot.rest, (1, 2, 1))
-    states = SimpleNamespace(qpos=rest, qvel=np.zeros((1, 2, robot.host.nv)))
-    values = {"drive.kp": np.array([robot.drive_gain[0]])} if robot.motors else {}
-    seen = RobotDrive(robot, {})(values, states, commands, 0, np.zeros((1, 2, 3)))[0]
+    second = round(1 / robot.host.opt.timestep)
+    seen = from_rest(robot, np.array([[v, 0.0], [0.0, omega]]))
     straight, spot = seen
     yaw = np.unwrap(straight[:, 2])
     step = np.diff(straight[second:, :2], axis=0)

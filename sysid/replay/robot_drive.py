@@ -99,16 +99,20 @@ class RobotDrive:
         return np.stack([where[..., 0], where[..., 1], yaw, (left + right) / 2, (right - left) / robot.track], axis=-1)
 
 
+def from_rest(robot: Robot, commands: np.ndarray) -> np.ndarray:
+    """Motion (B, S, 6) of drives of `SECONDS` from rest, each with one command (B, 2) that is reached in `RAMP`."""
+    count, steps = len(commands), round(SECONDS / robot.host.opt.timestep)
+    ramp = np.minimum(np.arange(1, steps + 1) * robot.host.opt.timestep / RAMP, 1.0)
+    states = SimpleNamespace(qpos=np.tile(robot.rest, (1, count, 1)), qvel=np.zeros((1, count, robot.host.nv)))
+    values = {"drive.kp": np.array([robot.drive_gain[0]])} if robot.motors else {}
+    return RobotDrive(robot, {})(values, states, commands[None, :, None] * ramp[:, None], 0, np.zeros((1, count, 3)))[0]
+
+
 def rolling_ratio(robot: Robot) -> float:
     """Way of a straight drive over what its wheels turn times their radius: soft contacts let them sink, and roll on
     less. 1 where the robot does not drive."""
-    steps, half = round(SECONDS / robot.host.opt.timestep), round(SECONDS / 2 / robot.host.opt.timestep)
-    commands = np.zeros((1, 1, steps, 2))
-    ramp = np.minimum(np.arange(1, steps + 1) * robot.host.opt.timestep / RAMP, 1.0)
-    commands[..., 0] = SPIN * robot.wheel_radius * ramp
-    states = SimpleNamespace(qpos=robot.rest[None, None], qvel=np.zeros((1, 1, robot.host.nv)))
-    values = {"drive.kp": np.array([robot.drive_gain[0]])} if robot.motors else {}
-    path = RobotDrive(robot, {})(values, states, commands, 0, np.zeros((1, 1, 3)))[0, 0, half:]
+    path = from_rest(robot, np.array([[SPIN * robot.wheel_radius, 0.0]]))[0]
+    path = path[round(SECONDS / 2 / robot.host.opt.timestep) :]
     turned = path[1:, 3].sum() * robot.host.opt.timestep
     way = np.hypot(*np.diff(path[:, :2], axis=0).T).sum()
     ratio = float(way / turned) if turned > 0 else 1.0

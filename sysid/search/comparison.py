@@ -16,11 +16,10 @@ from sysid.logs.records import Log
 from sysid.replay.differences import make_replay
 from sysid.replay.records import Simulated
 from sysid.replay.rollout import predictions
-from sysid.search import least_squares, starts, tpe
+from sysid.search import least_squares, starts, studies
 from sysid.search.fitting import Problem
 from sysid.search.result import Progress, Stages, Trace
-from sysid.search.settings import FitConfig
-from sysid.search.studies import BATCH
+from sysid.search.settings import BATCH, FitConfig
 from sysid.search.valleys import gradient_search
 
 METHODS = ("features", "lm", "both", "tpe", "cmaes")
@@ -86,11 +85,12 @@ def trace(
     watched = replace(objective, replay=recorder)
     points = least_squares.random_starts(space, effort.starts, seed)
     if method in BATCH:
-        tpe.fit(watched, space, tpe.GlobalSearch(effort.evaluations, seed, method=method), progress=progress)
+        search = studies.GlobalSearch(effort.evaluations, seed, method=method)
+        studies.global_search(watched, space, search, progress=progress)
     else:
         if method == "both":  # as a fit does it: from the initial values, and from the best of a short global search
-            short = tpe.GlobalSearch(min(effort.evaluations, FitConfig().trials), seed, best=1)
-            scan = tpe.fit(watched, space, short, progress=progress)
+            short = studies.GlobalSearch(min(effort.evaluations, FitConfig().trials), seed, best=1)
+            scan = studies.global_search(watched, space, short, progress=progress)
             points = np.concatenate([points[:1], scan.starts])
         if method == "features":
             points = starts.draw(watched, range(effort.starts), judge.track, seed)

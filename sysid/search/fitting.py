@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,7 +14,7 @@ from sysid.errors.pose_objective import DriveResiduals, Noise, Objective, Replay
 from sysid.errors.prior import Prior, bounds_alone, make_prior
 from sysid.errors.space import Space, make_space, robust_cost, searched
 from sysid.intervals import uncertainty
-from sysid.intervals.profiles import Minimum, Profile, check_names, profile
+from sysid.intervals.profiles import Profile, check_names, profile
 from sysid.logs import odometry_frames
 from sysid.logs.log import of_file
 from sysid.logs.records import CHANNEL_NAMES, Log, Prediction, Trial
@@ -27,7 +26,7 @@ from sysid.replay.models import Model
 from sysid.replay.records import Plant
 from sysid.replay.rollout import predictions, vehicle_plant
 from sysid.replay.wheel_model import wheel_model
-from sysid.search import least_squares, settings, slopes, starts, thin, tpe
+from sysid.search import least_squares, settings, slopes, starts, studies, thin
 from sysid.search.result import FitResult, Progress, Stages
 from sysid.search.settings import FitConfig
 from sysid.search.stated import chosen_sizes
@@ -36,10 +35,10 @@ from sysid.search.valleys import FIRST, LOOK, gradient_search
 from whill_mjx.io.command_line import check_options
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.vehicle_file import load_intervals, read_vehicle
 
 PASSIVE = "slip_traction.mu_free"
-CENTRE = ("body.com_x", "body.com_y", "body.com_z")
-"""Of a skid-steered robot they move the point about which it turns; to a log the tracked point's place is the same."""
+CENTRE = ("body.com_x", "body.com_y", "body.com_z")  # of a skid-steered robot they move the tracked point only
 INSTEAD = ("{} is skid-steered: the simulator's vehicle is fitted in its place, with the file's mass distribution and "
            "places of wheels")
 
@@ -65,8 +64,7 @@ class Fit:
     prior: Prior | None = None  # of an earlier vehicle file
     model: Model | None = None  # what was fitted in place of the simulator's vehicle
     likelihoods: tuple[Profile, ...] = ()  # profile likelihoods of the parameters that `profile` names
-    frame: float | None = None
-    """Time between the frames of the odometry [s] (`sysid.logs.odometry_frames`), where they show."""
+    frame: float | None = None  # time between frames of the odometry [s] (`sysid.logs.odometry_frames`)
     stated: tuple[str, ...] = ()  # groups of sizes that keep their stated values (`sysid.search.stated`)
     replay: Replays | None = None  # of the training trials; what it has compiled serves other trials too
 
@@ -77,9 +75,8 @@ def fit_log(
 ) -> Fit:
     """Fit the training trials of a log; its held-out trials are not looked at.
 
-    Args:
-        params: where the search starts; by default the preset's values for the log's vehicle.
-        model: what is fitted in place of the simulator's vehicle; by default what `config.model` names.
+    The search starts at `params`, by default the preset's values for the log's vehicle. `model` is fitted in place of
+    the simulator's vehicle, by default what `config.model` names.
     """
     config = config or FitConfig()
     check_options(config)
@@ -111,7 +108,7 @@ def fit_log(
         residuals = chosen.residuals(space.to_unit(space.initial)[None])
         initial_cost = float(robust_cost(residuals, config.robust)[0]) / chosen.counted
     known = uncertainty.estimate(chosen, u, robust=robust)
-    traced = profile(chosen, Minimum(u, known, config.robust), wanted, progress=progress) if wanted else []
+    traced = profile(chosen, known, wanted, config.robust, progress=progress) if wanted else []
     if config.calibrate and not config.all_sizes and config.vehicle is None and config.method not in settings.GLOBAL:
         if progress is not None:
             progress(0, "sizes: stated or free")
@@ -141,10 +138,10 @@ def _first_points(
         problem = {"data": log.sha256, "trials": ", ".join(trial.name for trial in objective.trials),
                    "channels": config.channels, "model": config.preset if given.model is None else given.model.name,
                    "step": f"{given.plant.dt:g}"}
-        search = tpe.GlobalSearch(evaluations, config.seed, cost, "cmaes" if config.method == "cmaes" else "tpe",
+        search = studies.GlobalSearch(evaluations, config.seed, cost, "cmaes" if config.method == "cmaes" else "tpe",
                                   count - 1)
-        scan = tpe.fit(objective, space, search, StudyPlace(config.storage, config.study, problem),
-                       stages.begin("global search"))
+        place = StudyPlace(config.storage, config.study, problem)
+        scan = studies.global_search(objective, space, search, place, stages.begin("global search"))
         return scan, None, np.concatenate([points[:1], scan.starts])[:count]
     if config.method == "features":
         first = stages.begin("features of motion")
@@ -260,7 +257,7 @@ def _subject(
         plant = vehicle_plant(log.spec, VehicleConfig(physics_dt=config.physics_dt))
         given = params is not None
         if config.vehicle is not None:
-            params, intervals = _earlier(config.vehicle)
+            params, intervals = read_vehicle(config.vehicle)[1], load_intervals(config.vehicle)
         start = preset_params(log.spec, config.preset) if start is None else start
         params = start if params is None else params
         receipt = log.fields.get("pose_stamps") == "receipt"
@@ -311,19 +308,10 @@ def subject(log: Log, config: FitConfig, model: Model | None = None) -> tuple[Lo
 
 def of_earlier(log: Log, config: FitConfig) -> Log:
     """The log as one of the vehicle of an earlier file, where the settings name one."""
-    from whill_mjx.vehicle.vehicle_file import read_vehicle
-
     if config.vehicle is None or config.model:
         return log
     refuse_recording(config.vehicle, "a vehicle file.")
     return of_file(log, read_vehicle(config.vehicle)[0], str(config.vehicle))
-
-
-def _earlier(path: Path) -> tuple[Any, dict[str, tuple[float, float]]]:
-    """Parameters and intervals of a vehicle file."""
-    from whill_mjx.vehicle.vehicle_file import load_intervals, read_vehicle
-
-    return read_vehicle(path)[1], load_intervals(path)
 
 
 def make_objective(plant: Plant, params: Any, space: Space, trials: tuple[Trial, ...], noise: Noise) -> Objective:

@@ -33,10 +33,8 @@ class BoxStep:
     high: Any = 1.0
     reach: Any = 0.3  # largest step, or a function that gives it (N, P) at u (N, P)
     free: Any = True  # (P,) or (N, P): False for parameters that keep their value
-    move: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.add
-    """Where a step (N, P) from u (N, P) leads (`Space.moved`)."""
-    passes: int = 3
-    """Solutions at most, each with more parameters held: cutting one at its wall may lead another to its own."""
+    move: Callable[[np.ndarray, np.ndarray], np.ndarray] = np.add  # where a step from u leads
+    passes: int = 3  # solutions at most: cutting one parameter at its wall may lead another to its own
     adapt: bool = False  # hold whatever is cut, by its reach too, at the cut step; otherwise only what begins at a wall
     floor: float = 1e-6  # damping of parameters that do nothing, as a share of the largest curvature
     ridge: float = 0.0  # share of the largest curvature that is added whatever the damping

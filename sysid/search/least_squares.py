@@ -1,8 +1,7 @@
 """Bounded Levenberg-Marquardt from several starts at once.
 
-Each iteration is one batched Jacobian and one batched replay of several dampings per start; starts that have converged
-wait. A Jacobian takes two replays for each parameter, so a few more tries follow without a new one: shorter steps where
-none helped, else steps that learn what they can of the derivatives (Broyden 1965). Steps are in unit coordinates.
+Each iteration is one batched Jacobian and one batched replay of several dampings per start. A few more tries follow
+without a new Jacobian: shorter steps where none helped, else with derivatives updated by the step (Broyden 1965).
 """
 
 from __future__ import annotations
@@ -10,34 +9,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from sysid.errors.space import Residuals, Space, huber_weight, is_delay, robust_cost
+from sysid.errors.normal_equations import NormalEquations
+from sysid.errors.space import Residuals, Space, huber_weight, robust_cost
 from sysid.search.gauss_newton import BoxStep, GaussNewton, Patience, State, Try, normal_sums
 from sysid.search.result import FitResult, Progress
 from whill_mjx.io.steps import step
 
 DAMPINGS = (0.1, 1.0, 10.0, 1000.0)  # factors on each start's damping that are tried in one iteration
-MANY_DAMPINGS = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e5, 1e6)
-"""The same on an accelerator, where more tries take no longer, and a second call as long as the first."""
+MANY_DAMPINGS = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4, 1e5, 1e6)  # on an accelerator: more tries take no longer
 GRID, APART = 6, 0.1  # points over a range, of which those so far away may lie in another valley
 DELAYS, NEAR = 16, (0.005, 0.0003)
-"""Points over the range of a delay; six more on both sides are so far apart [s], for each: a step of the controller's
-clock, and what a step of the physics, in which wheels begin to slip or torques reach their limit, makes of it."""
+"""Points over the range of a delay; six more on both sides are so far apart [s], for each: about a step of the
+controller's clock, and of the physics."""
 PLATEAU = 0.02  # share of the cost within which they lie on the same ground
 FOLLOWING = 3  # tries at most without a new Jacobian
 PROMISE = 0.5  # share of the foretold fall of the cost that a step must bring, so that one follows
 GOES_ON = 10.0  # tolerances by which a step that is not the last lowers the cost
-
-
-class Sums(Protocol):
-    """Costs and normal equations that an accelerator sums up: `sysid.errors.normal_equations.NormalEquations`."""
-
-    def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray: ...
-
-    def quadratic(self, u: np.ndarray, robust: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
 
 
 @dataclass(frozen=True)
@@ -101,7 +92,7 @@ class _Descent:
     objective: Residuals
     solver: GaussNewton
     robust: bool
-    equations: Sums | None
+    equations: NormalEquations | None
 
     def kept(self, state: State) -> tuple[State, np.ndarray, int]:
         """As `advanced`, as a step that is kept (`whill_mjx.io.steps`)."""
@@ -224,7 +215,7 @@ def profile_delays(
     by one damped Gauss-Newton step, which shows whether another valley is as deep.
     """
     profiles, space = [], objective.space
-    delays = [index for index, name in enumerate(space.names) if is_delay(name)]
+    delays = [index for index, name in enumerate(space.names) if "delay" in name or "latency" in name]
     if not delays:
         return []
     tangent = cache(lambda: _Tangent.at(objective, u, robust))

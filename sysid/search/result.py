@@ -35,13 +35,10 @@ class FitResult:
     cost: float
     initial_cost: float  # cost of the first candidate, the initial values
     evaluations: int
-    starts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    """(S, P) end points of the search: the best candidates of TPE, the end of each start of LM."""
+    starts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (S, P) ends, or best candidates
     start_costs: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (S,) cost of each of them, where known
-    order: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    """(S,) which of the given starts each of them comes from, in a gradient search."""
-    history: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Best cost so far after each evaluation or iteration."""
+    order: np.ndarray = field(default_factory=lambda: np.zeros(0, int))  # (S,) which given starts they are of
+    history: np.ndarray = field(default_factory=lambda: np.zeros(0))  # best cost after each
 
     @property
     def as_given(self) -> tuple[np.ndarray, np.ndarray]:

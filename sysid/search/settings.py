@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from sysid.errors.prior import SPREAD
-from sysid.search.studies import BATCH
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range, With
 
 QUICK_TRIALS = 24  # trials fitted in quick mode, spread over the log
@@ -15,6 +14,7 @@ QUICK_EVALUATIONS = 64
 QUICK_ITERATIONS = 14
 TRIED, TOGETHER = 4, 3.0  # steps on poses, and how often their errors may count the same information
 FEATURE_ITERATIONS = 20
+BATCH = {"tpe": 4, "cmaes": 16}  # candidates simulated together: at no loss on a processor; a population
 GLOBAL = tuple(BATCH)  # methods that end with their global search
 
 

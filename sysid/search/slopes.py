@@ -1,9 +1,7 @@
-"""Slopes of residuals over the range that estimates err in.
+"""Slopes of residuals over the range that estimates err in: the floor of a cost is jagged, where wheels stick or slip.
 
-Wheels stick or slip, torques meet their limit and delays act in steps: the floor of a cost is jagged, and its slopes
-depend on how far they look. Differences over a fixed share of a range lead there from afar, and then determine some
-parameters half, others twice as well as the log does. A plane through residuals at points of the ellipsoid of the
-errors has the slopes that count (statistical linearisation; Gelb, 1974, chapter 6).
+A plane is laid through residuals at points of the ellipsoid of the errors (statistical linearisation; Gelb, 1974,
+chapter 6).
 """
 
 from __future__ import annotations
@@ -26,8 +24,7 @@ EXACT = 1e-9  # least cost, in squared noise scales: a model that fits to the la
 ROUNDS, MISSES, WORTH = 24, 3, 2e-4
 """Maximum rounds of a descent; patience; the share of the cost that a round must gain unless squares fall by one."""
 DAMPINGS = tuple(np.logspace(-6, 1, 15))  # tried in each round
-SIZES = (1.0, 0.3)
-"""Of the ellipsoid, in turn: its own size, and one within which the parameters that move little act linearly."""
+SIZES = (1.0, 0.3)  # of the ellipsoid, in turn; within the smaller one parameters that move little act linearly
 
 
 def average_slopes(
@@ -70,19 +67,14 @@ def within(u: np.ndarray, moves: np.ndarray, covariance: np.ndarray) -> np.ndarr
     return moves * np.minimum(room.min(1, keepdims=True), 1.0)
 
 
-def likely(jacobian: np.ndarray, variance: float) -> np.ndarray:
-    """Covariance (P, P) of errors in unit coordinates, for residuals with these derivatives (B, K, P)."""
-    return likely_by(_products(jacobian), variance)
-
-
-def _products(jacobian: np.ndarray) -> np.ndarray:
+def products(jacobian: np.ndarray) -> np.ndarray:
     """J^T J (P, P) of derivatives (B, K, P)."""
     rows = jacobian.reshape(-1, jacobian.shape[-1])
     return np.asarray(rows.T @ rows)
 
 
 def likely_by(hessian: np.ndarray, variance: float) -> np.ndarray:
-    """The same of J^T J (P, P)."""
+    """Covariance (P, P) of errors in unit coordinates, from J^T J (P, P) of residuals with this variance."""
     return np.linalg.inv(hessian / max(variance, EXACT) + np.eye(len(hessian)) / REACH**2)
 
 
@@ -92,19 +84,19 @@ def descend(
     """The result with where damped Gauss-Newton steps with averaged slopes lead from its u, as long as costs fall."""
     u, cost, spent, misses = result.u, result.cost, 0, 0
     box, history = BoxStep(move=objective.space.moved), []
-    (products,) = step("slopes", lambda: [_products(objective.jacobian(u[None])[1][0])], u)
+    (hessian,) = step("slopes", lambda: [products(objective.jacobian(u[None])[1][0])], u)
     for number in range(ROUNDS):
         before = cost
-        covariance = likely_by(products, cost) * SIZES[number % len(SIZES)] ** 2
+        covariance = likely_by(hessian, cost) * SIZES[number % len(SIZES)] ** 2
 
         def compute(u: np.ndarray = u, covariance: np.ndarray = covariance, seed: int = seed + number) -> list[Any]:
             residual, slopes = average_slopes(objective, u, covariance, seed)
             weight = huber_weight(residual) if robust else None
-            (gradient,), (hessian,) = normal_sums(residual[None], slopes[None], weight)
-            points = box.points(np.tile(u, (len(DAMPINGS), 1)), gradient, hessian, np.array(DAMPINGS))
-            return [_products(slopes), points, robust_cost(objective.residuals(points), robust) / objective.counted]
+            (gradient,), (curvature,) = normal_sums(residual[None], slopes[None], weight)
+            points = box.points(np.tile(u, (len(DAMPINGS), 1)), gradient, curvature, np.array(DAMPINGS))
+            return [products(slopes), points, robust_cost(objective.residuals(points), robust) / objective.counted]
 
-        products, points, costs = step("round", compute, u, covariance)
+        hessian, points, costs = step("round", compute, u, covariance)
         spent += 1 + 2 * ROTATIONS * len(u) + len(points)
         if costs.min() < cost:
             u, cost = points[costs.argmin()], float(costs.min())

@@ -1,8 +1,6 @@
 """Where the search starts: the vehicle fitted to its motion in short bins, with noise that has no memory.
 
-A pose adds up all motion before it: far from the truth its error has folds in which a search stays; that of short bins
-has not. Searches still end in valleys of a wrong delay or torque limit: a start is the best end of searches from the
-best of many random points.
+A start is the best end of searches from the best of many random points (docs/fit_method.md).
 """
 
 from __future__ import annotations
@@ -18,10 +16,8 @@ from sysid.errors.pose_objective import Objective
 from sysid.search import least_squares
 from sysid.search.result import FitResult, Progress
 
-SCAN = 256
-"""Random points that are replayed for one start; a search from a random point itself ends in the nearest valley."""
-KEPT, FIRST = 8, 3
-"""The best of them, and iterations from each: two of eight lead to the deepest valley, a few nearly show which."""
+SCAN = 256  # random points that are replayed for one start
+KEPT, FIRST = 8, 3  # the best of them, and iterations from each: a few nearly show which valley is deepest
 FOLLOWED, STEPS = 2, 20  # how many of those are searched further, and in how many iterations at most
 EDGE = 0.02  # of the range, at both ends, without random points
 CHUNK = 512  # points whose residuals are kept at once
@@ -32,11 +28,8 @@ TOLERANCE = 1e-3  # share of the cost by which it must fall for a start to go on
 def fit(
     objective: Objective, points: np.ndarray, track: float, iterations: int = 15, progress: Progress | None = None
 ) -> FitResult:
-    """Fit features from all starts, unit coordinates (S, P), then from the best one with the noise that it leaves.
-
-    The result is the best point; `start_costs` are those of the first fit, ascending. The replay is the poses'
-    `objective`'s.
-    """
+    """Fit features from all starts, unit coordinates (S, P), then from the best one with the noise that it leaves. The
+    result is the best point; `start_costs` are those of the first fit, ascending. The replay is that of `objective`."""
     coarse = make_features_objective(objective, track).quicker
     found = least_squares.fit(coarse, starts=points, stop=least_squares.Stopping(iterations, TOLERANCE),
                               progress=progress)
@@ -52,10 +45,8 @@ def draw(
     objective: Objective, numbers: Sequence[int], track: float, seed: int, scan: int = SCAN,
     progress: Progress | None = None,
 ) -> np.ndarray:
-    """Starts (S, P) of a search: number 0 has the initial values, any other the best of `scan` random points.
-
-    A start is the same whichever others are drawn with it. The replay is the poses' `objective`'s; `track` in m.
-    """
+    """Starts (S, P) of a search: number 0 has the initial values, any other the best of `scan` random points, whichever
+    others are drawn with it. The replay is that of `objective`; `track` in m."""
     space = objective.space
     first = space.to_unit(space.initial)
     scanned = [number for number in numbers if number > 0]

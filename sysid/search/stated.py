@@ -1,9 +1,6 @@
-"""Sizes that need not be freed: drives that are held back are foretold as well with what data sheet and rulers say.
+"""Groups of sizes that keep their stated values, since drives that are held back are predicted as well so.
 
-Few drives determine sizes of wheels, scales of the odometry and the tracked point only together with slip, scrub and
-lags: freeing what was right makes other drives worse. Groups that all drives contradict are free. Others stay free
-where they make whole drives better that were held back, each manoeuvre in turn, all other parameters following the
-rest. Source: Stone (1974), cross-validatory choice.
+The method is in docs/fit_method.md, section 7. Source: Stone (1974), cross-validatory choice.
 """
 
 from __future__ import annotations
@@ -52,11 +49,8 @@ def chosen_sizes(
 ) -> Choice:
     """The point (P,) at which only those groups differ from what was stated that the drives need.
 
-    Args:
-        objective: what the search ended on; `cost` there, and `known`: errors and information of each drive there.
-        poses: errors of whole poses of the same drives.
-        kept: parameters that a person chose to fit.
-        robust: whether large residuals count linearly.
+    The search ended on `objective`, at `cost`; `known` has errors and information of each drive there, `poses` the
+    errors of their whole poses. A person chose to fit what is `kept`.
     """
     space, evidence, u = objective.space, known.evidence, known.evidence.u
     free = set(kept) | contradicted(known, space)
@@ -89,9 +83,8 @@ def contradicted(known: Uncertainty, space: Space) -> set[str]:
 def simplest(errors: np.ndarray, held: np.ndarray) -> int:
     """The option that holds most and whose mean error is within a standard error of the least (Breiman et al., 1984).
 
-    From errors (G, O) of G manoeuvres and O options that hold `held` (O,) parameters; among as simple ones the best.
-    The standard error is of gains by the best option, its variance twice the mean square of those below 0: what a right
-    size gains in a single manoeuvre is no noise.
+    From errors (G, O) of G manoeuvres and O options that hold `held` (O,) parameters. The variance of gains by the best
+    option is twice the mean square of those below 0: what a right size gains in a single manoeuvre is no noise.
     """
     mean = errors.mean(0)
     gains = errors - errors[:, [mean.argmin()]]

@@ -1,10 +1,8 @@
-"""Studies of a global search that several processes share, and that outlive any of them.
+"""Global search with Optuna, TPE or CMA-ES, in studies that several processes share and that outlive any of them.
 
-A study lives in a journal file (`journal:FILE`; on a file system that all processes see) or in a database by its URL
-(`postgresql://user@host/name`, which needs psycopg2; a password is neither printed nor stored, and is better kept in
-the file ~/.pgpass or in PGPASSWORD). Every process that searches in it asks for candidates in batches,
-simulates a batch in one replay and tells the costs. A process that is killed leaves candidates that were asked for and
-never told: the next one to look puts them back into the queue. Costs that were told are in the storage.
+A study lives in a journal file (`journal:FILE`) or in a database by its URL, whose password is neither printed nor
+stored. Processes ask for candidates in batches, simulate a batch in one replay and report the costs. What a killed
+process leaves without a cost, the next one to look puts back into the queue.
 """
 
 from __future__ import annotations
@@ -17,14 +15,18 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from urllib.parse import unquote, unquote_plus
 
 import numpy as np
 
-BATCH = {"tpe": 4, "cmaes": 16}
-"""Candidates simulated together: of TPE as many as a processor replays at no loss, of CMA-ES its population."""
+from sysid.errors.pose_objective import Objective
+from sysid.errors.space import Space
+from sysid.search.result import FitResult, Progress
+from sysid.search.settings import BATCH
+from whill_mjx.io.steps import step
+
 STARTUP = 32  # random candidates of TPE before it draws from those that it knows
 LEASE = 600.0  # seconds after which a process on another machine that has not been heard of counts as dead
 POLL = 0.2  # s between looks while others finish
@@ -115,8 +117,7 @@ class StudyPlace:
 
     storage: Any = None  # of `open_storage`, or what it opens; None keeps the study in memory
     name: str = "fit"
-    problem: Mapping[str, str] = field(default_factory=dict)
-    """What is searched, as short texts; a study of another problem is refused."""
+    problem: Mapping[str, str] = field(default_factory=dict)  # what is searched; a study of another one is refused
 
 
 class SharedStudy:
@@ -125,10 +126,8 @@ class SharedStudy:
     def __init__(
         self, names: tuple[str, ...], initial: np.ndarray, place: StudyPlace, *, method: str = "tpe", seed: int = 0
     ):
-        """Create or join the study of parameters `names` (unit coordinates), which begins at `initial` (P,).
-
-        ValueError where the study is of another problem, or the method is unknown.
-        """
+        """Create or join the study of parameters `names` (unit coordinates), which begins at `initial` (P,); ValueError
+        where the study is of another problem, or the method is unknown."""
         import optuna
 
         if method not in BATCH:
@@ -308,3 +307,38 @@ def _alive(pid: int) -> bool:
             return file.read().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return True
+
+
+@dataclass(frozen=True)
+class GlobalSearch:
+    """How a global search goes."""
+
+    evaluations: int = 500  # parameter sets to try; in a shared study, by all its processes together
+    seed: int = 0
+    cost: str = "weighted"  # "weighted" (least squares over all channels) or "paper" (sum of position RMSE)
+    method: str = "tpe"  # "tpe" or "cmaes"
+    best: int = 4  # how many of the best candidates to return in `starts`
+
+
+def global_search(
+    objective: Objective, space: Space, search: GlobalSearch, place: StudyPlace = StudyPlace(),  # noqa: B008
+    progress: Progress | None = None,
+) -> FitResult:
+    """Minimise an objective over `space`, from the initial values on, in a study that processes may share."""
+    costs: Callable[[np.ndarray], np.ndarray] = {
+        "weighted": objective.weighted_cost, "paper": objective.paper_cost}[search.cost]
+    about = {"cost": search.cost, "initial values": ", ".join(f"{value:.6g}" for value in space.initial),
+             "bounds": ", ".join(f"{low:.6g} to {high:.6g}" for low, high in zip(space.low, space.high, strict=True)),
+             **place.problem}
+    shared = SharedStudy(space.names, space.to_unit(space.initial), replace(place, problem=about),
+                         method=search.method, seed=search.seed)
+
+    def kept(u: np.ndarray) -> np.ndarray:
+        """Costs as a step, unless a storage keeps them: others may have added to it since."""
+        return costs(u) if place.storage else step("candidates", lambda: [costs(u)], u)[0]
+
+    shared.run(kept, search.evaluations, progress)
+    u, values, initial = shared.table()
+    order = np.argsort(values)
+    return FitResult(u=u[order[0]], cost=float(values[order[0]]), initial_cost=float(values[initial]),
+                     evaluations=len(values), starts=u[order[: search.best]], history=np.minimum.accumulate(values))

@@ -1,8 +1,4 @@
-"""The gradient search on poses, and where else it looks: costs of drives have many valleys.
-
-A search ends in the valley that it starts in. Others are looked for at the ends of ranges, far along them, and at other
-delays; so parameters are found that a drive hardly determines, or only beyond a limit.
-"""
+"""The gradient search on poses, and where else it looks: costs of drives have many valleys (docs/fit_method.md)."""
 
 from __future__ import annotations
 
@@ -19,26 +15,22 @@ from sysid.search.settings import FitConfig
 
 VALLEY = 0.05  # share of the cost by which another delay may be worse and still be searched from
 FLAT = 1.6  # factor on the cost within which an end of a range may be worse and still be searched from
-DEAR, FAR = 10.0, 12
-"""Factor on the cost within which a point far along a range may be worse and be searched from, and from how many."""
-FIRST, KEPT, LOOK = 1, 2, 3
-"""Iterations from all of these, how many are searched further, and iterations after which one must be better."""
+DEAR, FAR = 10.0, 12  # factor on the cost within which points far along a range are searched from, and how many
+FIRST, KEPT, LOOK = 1, 2, 3  # iterations from all, how many are searched further, and when one must be better
 LAST = 3  # iterations on whole drives at most, after those in pieces of an accelerator
 LOST = 0.5  # share of the cost below which a search from elsewhere shows that the one before was far from right
 WORTH = 0.001  # share of the cost that another valley must save for the floor to be followed from there
 
-Search = Callable[[DriveResiduals, np.ndarray, int], FitResult]
-"""From all of starts (S, P), for so many iterations at most."""
+Search = Callable[[DriveResiduals, np.ndarray, int], FitResult]  # from starts (S, P), for so many iterations
 
 
 def gradient_search(
     objective: DriveResiduals, starts: np.ndarray, iterations: int, config: FitConfig, stages: Stages | None
 ) -> tuple[FitResult, DriveResiduals, list[tuple[str, np.ndarray, np.ndarray]]]:
-    """LM from all starts. Then the noise is the one that it leaves, where it was not known, and LM continues.
+    """LM from all starts, and again with the noise that it leaves, where it was not known.
 
     With `config.elsewhere` other valleys are tried: ends of ranges that cost little, points far along every range,
-    delays on a grid. Floors are jagged: at the end slopes averaged over what estimates err lead on
-    (`sysid.search.slopes`), and the ends of ranges are tried again, since what hid them may be gone.
+    delays on a grid. Then averaged slopes lead on (`sysid.search.slopes`), and the ends of ranges are tried again.
     """
 
     binned = isinstance(objective, FeatureObjective)

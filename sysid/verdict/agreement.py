@@ -10,12 +10,9 @@ from scipy import special
 
 from sysid.missing.joint_fit import Refit
 
-ALPHA = 0.05
-"""Of the test whether manoeuvres differ on a size."""
-POWER = 0.8
-"""Least power of a manoeuvre to separate an effect from none, for it to be asked; and of that test, to be believed."""
-SCATTER = 0.5
-"""Standard deviation from manoeuvre to manoeuvre, as a share of the size, that the test should see."""
+ALPHA = 0.05  # of the test whether manoeuvres differ on a size
+POWER = 0.8  # least power of a manoeuvre to separate an effect from none, to be asked; and of that test
+SCATTER = 0.5  # standard deviation from manoeuvre to manoeuvre, as a share of the size, that the test should see
 RESAMPLES = 2000
 RIDGE = 1e-9
 
@@ -25,16 +22,11 @@ class Heterogeneity:
     """Cochran's test that an effect has one size in all manoeuvres that excite it."""
 
     asked: np.ndarray  # (G,) bool, manoeuvres that by themselves would separate the effect from none
-    q: float
-    """Squared differences from the mean over their variances, about chi-squared with one less than asked where the size
-    is one."""
+    q: float  # squared differences from the mean over their variances, about chi-squared (asked - 1) for one size
     p: float
-    scatter: float
-    """Standard deviation of the sizes beyond the noise, as a share of the mean."""
-    least: float
-    """Lower 95 % end of it, or less: the mean is not known exactly either."""
-    power: float
-    """To see a scatter of `SCATTER`."""
+    scatter: float  # standard deviation of the sizes beyond the noise, as a share of the mean
+    least: float  # lower 95 % end of it, or less: the mean is not known exactly either
+    power: float  # to see a scatter of `SCATTER`
 
     @property
     def outcome(self) -> str:
@@ -84,15 +76,8 @@ def with_prior(fit: Refit, precision: np.ndarray) -> np.ndarray:
 def sizes_apart(
     fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(G,) size that each manoeuvre by itself asks of some coordinates, as a factor on the fitted one, and its error.
-
-    All else - base parameters, other coordinates - is as the other manoeuvres have it, and may move as far as they
-    allow. A linear step from the joint fit.
-
-    Args:
-        part: coordinates of an effect within q.
-        groups: trials of each manoeuvre.
-    """
+    """(G,) size that each manoeuvre by itself asks of the coordinates `part` of q, as a factor on the fitted one, and
+    its error. All else is as the other manoeuvres have it, and may move as far as they allow. A linear step."""
     size = len(fit.u)
     index = np.arange(size + part.start, size + part.stop)
     matrix = with_prior(fit, precision)
@@ -111,10 +96,8 @@ def sizes_apart(
 
 
 def foretold(fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray) -> np.ndarray:
-    """(G,) by how much some coordinates, fitted to all other manoeuvres, lower the squared residual of each manoeuvre.
-
-    Compared with a fit without them, to the same other manoeuvres. Linear, around the joint fit.
-    """
+    """(G,) by how much the coordinates `part` of q, fitted to all other manoeuvres, lower the squared residual of each
+    manoeuvre, beside a fit without them. Linear, around the joint fit."""
     size, columns = len(fit.u), fit.jacobian.reshape(fit.residual.size, -1)
     index = np.arange(size + part.start, size + part.stop)
     kept = np.delete(np.arange(columns.shape[1]), index)
@@ -139,13 +122,10 @@ def left_out(design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: 
 def log_densities(
     design: np.ndarray, prior: np.ndarray, target: np.ndarray, groups: Sequence[Sequence[int]], noise: float
 ) -> np.ndarray:
-    """(G,) log density of each manoeuvre in a target (B, n / B), as columns (n, F) with precision (F, F) predict it
-    from the other manoeuvres. What does not depend on the columns is left out.
+    """(G,) log density of each manoeuvre in a target (B, n / B) with this variance of the noise, as columns (n, F) with
+    precision (F, F) predict it from the other manoeuvres. What does not depend on the columns is left out.
 
     What the other manoeuvres do not determine is unsure, not wrong: an effect may be of another size in each of them.
-
-    Args:
-        noise: variance of the target beside the columns.
     """
     columns = design.reshape(len(target), -1, design.shape[1])
     design, flat = design / noise**0.5, target.reshape(-1) / noise**0.5

@@ -21,7 +21,7 @@ from dataclasses import replace
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import EFFORT, LARGEST, PairScan, Search
+from sysid.verdict.found import LARGEST, ROUNDS, PairScan, Search
 from sysid.verdict.posterior import NOTHING
 from sysid.verdict.rounds import Asked, candidates_of, class_of, held_back
 from whill_mjx.effects import card_of
@@ -50,7 +50,7 @@ def search_alone(asked: Asked, pairs: PairScan | None = None, wheels: bool = Tru
     if asked.scan.p_family >= thresholds.alpha:
         return _said(asked, found, NOTHING)
     against, unseen, hidden = "what stands out in a linear scan does not hold in a refit", "", 0.0
-    while len(found.accepted) < EFFORT.rounds and len(found.rounds) < 2 * EFFORT.rounds:
+    while len(found.accepted) < ROUNDS and len(found.rounds) < 2 * ROUNDS:
         candidates = candidates_of(asked, found, found.final)
         likely = [(one, held_back(asked, one.refit)) for one in candidates if one.p < thresholds.alpha]
         standing = [(one, gains) for one, gains in likely if interval_of_sum(gains)[0] > 0]

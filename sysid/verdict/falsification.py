@@ -1,4 +1,4 @@
-"""Whether drives do what the law of an effect forbids."""
+"""Whether drives do what the law of an effect forbids (`sysid.verdict.falsifiers`)."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ import numpy as np
 from scipy import stats
 
 from sysid.logs.records import Trial, command_in_force
-from sysid.missing.joint_fit import Refit, moved_last, without_each
-from sysid.missing.refit import Refitter
+from sysid.missing.joint_fit import Refit, moved_last
+from sysid.missing.refit import Refitter, without_each
 from sysid.verdict.agreement import beside
 from sysid.verdict.falsifiers import QUIET, SPLITS, BinnedCourse, Tested
 from whill_mjx.effects import card_of
 from whill_mjx.effects.card import Falsifier
 
-ALPHA = 0.01
-"""Of all predictions of one effect together."""
-POWER = 0.8
-"""Least power with which drives must show the opposite for a prediction to count as tested."""
-LEFT = 1.0
-"""Largest share of what effects gain that may be left where one does nothing: with more it is not what stands out."""
+ALPHA = 0.01  # of all predictions of one effect together
+POWER = 0.8  # least power with which drives must show the opposite for a prediction to count as tested
+LEFT = 1.0  # largest share of what effects gain that may be left where one does nothing
 
 
 @dataclass(frozen=True)
@@ -71,11 +68,10 @@ def put_to_test(
 def sizes_in_parts(
     fit: Refit, part: slice, signatures: np.ndarray, refitter: Refitter, groups: Sequence[Sequence[int]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(S,) sizes of the parts of an effect, as factors on the joint fit, and their covariance (S, S).
+    """(S,) sizes of the parts of an effect, as factors on the joint fit, and their covariance (S, S): a linear step.
 
-    A linear step from the joint fit, beside base parameters within their spread and all other effects. The covariance
-    is the larger, part by part, of that of white noise and of one that takes manoeuvres as what is independent: the
-    form of an effect is never quite the catalogue's.
+    The covariance is the larger, part by part, of that of white noise and of one that takes manoeuvres as what is
+    independent: the form of an effect is never quite the catalogue's.
 
     Args:
         part: the effect's coordinates within q, which the parts take the place of.
@@ -112,9 +108,7 @@ def _same(law: Law, size: np.ndarray, covariance: np.ndarray, freedom: int) -> T
     return Tested(law.effect, falsifier, outcome, tuple(size.tolist()), error, p, power)
 
 
-def _absent(
-    law: Law, residual: np.ndarray, gains: tuple[float, float], p_excess: Callable[[float], float]
-) -> Tested:
+def _absent(law: Law, residual: np.ndarray, gains: tuple[float, float], p_excess: Callable[[float], float]) -> Tested:
     """Whether the residual (N,) where an effect does nothing is too large for it to be what is missing; `gains` has by
     how much it alone and all effects lower the cost."""
     count = float(len(residual))

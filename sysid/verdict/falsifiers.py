@@ -23,12 +23,9 @@ import numpy as np
 
 from whill_mjx.effects.card import Falsifier
 
-SETTLED = 1.5
-"""Time after the last change of the command from which it counts as constant [s]."""
-STRAIGHT = 0.02
-"""Yaw rate [rad/s] below which a vehicle drives straight."""
-MOVING = 0.02
-"""Speed [m/s], and yaw rate times half the track, below which motion has no direction."""
+SETTLED = 1.5  # time after the last change of the command from which it counts as constant [s]
+STRAIGHT = 0.02  # yaw rate [rad/s] below which a vehicle drives straight
+MOVING = 0.02  # speed [m/s], and yaw rate times half the track, below which motion has no direction
 
 
 @dataclass(frozen=True)
@@ -52,12 +49,9 @@ class Tested:
 
     effect: str
     falsifier: Falsifier
-    outcome: str
-    """holds, falsified, or untold: the drives would not have shown the opposite."""
-    sizes: tuple[float, ...]
-    """same: size in each part over that of the joint fit. absent: what is left there over what all effects gain."""
-    error: float
-    """Standard error of the difference that is tested."""
+    outcome: str  # holds, falsified, or untold: the drives would not have shown the opposite
+    sizes: tuple[float, ...]  # same: of each part over the joint fit; absent: what is left over what all gain
+    error: float  # standard error of the difference that is tested
     p: float
     power: float
 

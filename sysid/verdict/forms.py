@@ -14,17 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from sysid.missing.joint_fit import Refit, Replays, without_each
+from sysid.missing.joint_fit import Refit
+from sysid.missing.refit import Refitter, without_each
 from sysid.verdict.agreement import log_densities, solved
 
-MOST = 2.0
-"""Largest size of a modulation: it is 1 at the 90 % quantile of the speed."""
-QUANTITIES = (("speed", "m/s"), ("yaw rate", "rad/s"), ("time in the drive", "s"))
-"""What the form of an effect may depend on, with its unit."""
-POINTS = 41
-"""Points of a curve over one of them."""
-CONFIDENCE = 1.96
-"""Standard deviations to the ends of a 95 % band."""
+MOST = 2.0  # largest size of a modulation: it is 1 at the 90 % quantile of the speed
+QUANTITIES = (("speed", "m/s"), ("yaw rate", "rad/s"), ("time in the drive", "s"))  # that forms may depend on
+POINTS = 41  # points of a curve over one of them
+CONFIDENCE = 1.96  # standard deviations to the ends of a 95 % band
 
 
 @dataclass(frozen=True)
@@ -64,17 +61,12 @@ class Forms:
     bent: tuple[np.ndarray, ...]  # per effect (n, m): the same in other forms, together as large as it is
     precision: np.ndarray  # (P, P) of the base parameters
     shape: tuple[int, ...]  # (B, n / B) of the residual
-    units: tuple[float, ...]
-    """Per effect: factor on its modulations that makes them together as large as it is."""
+    units: tuple[float, ...]  # per effect: factor on its modulations that makes them together as large as it is
     centres: tuple[np.ndarray, ...]  # per effect (7,): means of the modulations by `QUANTITIES`, where it acts
     motion: Motion
 
     def left(self, form: float) -> np.ndarray:
-        """(B, n / B) what is left where all effects may have other forms.
-
-        Args:
-            form: root mean square of all forms of an effect together, as a share of what it changes.
-        """
+        """(B, n / B) what is left where all effects may have other forms, of size `form` beside what each changes."""
         columns = [self.base, *self.sizes]
         solution, design = self._solved(columns, self.bent, form, self.target)
         return (self.target - design @ solution).reshape(self.shape)
@@ -82,17 +74,9 @@ class Forms:
     def gain(
         self, form: float, number: int, groups: Sequence[Sequence[int]], noise: float = 1.0
     ) -> tuple[float, np.ndarray]:
-        """By how much one of the effects, in the form of its law, lowers the cost beside other forms of the others.
-
-        It is taken away whole: columns around its size say little of a dead zone or a limit without it.
-
-        Args:
-            noise: variance of the white residual.
-
-        Returns:
-            The gain on all drives; and by how much the effect raises the log density of each manoeuvre (G,), as all
-            other manoeuvres predict it.
-        """
+        """By how much one of the effects, in the form of its law, lowers the cost beside other forms of the others; and
+        by how much it raises the log density of each manoeuvre (G,), as all others predict it. `noise`: variance of the
+        white residual. The effect is taken away whole: columns around its size say little of a dead zone without it."""
         target = self.target + self.changes[number]
         others = [one for i, one in enumerate(self.sizes) if i != number]
         bent = [one for i, one in enumerate(self.bent) if i != number]
@@ -106,11 +90,8 @@ class Forms:
         return max(costs[0] - costs[1], 0.0), densities[1] - densities[0]
 
     def deviations(self, form: float, number: int, noise: float = 1.0) -> list[Deviation]:
-        """How far one of the effects is off the catalogue's law over speed, yaw rate and time, of its mean size.
-
-        Args:
-            noise: variance of the white residual.
-        """
+        """How far one of the effects is off the catalogue's law over speed, yaw rate and time, of its mean size;
+        `noise`: variance of the white residual."""
         columns, before = [self.base, *self.sizes], sum(one.shape[1] for one in self.bent[:number])
         solution, design = self._solved(columns, self.bent, form, self.target)
         covariance = solved(design.T @ design + self._prior(columns, self.bent, form), np.eye(design.shape[1])) * noise
@@ -141,7 +122,7 @@ class Forms:
         return solved(design.T @ design + self._prior(plain, bent, form), design.T @ target), design
 
 
-def forms_of(refitter: Replays, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:
+def forms_of(refitter: Refitter, fit: Refit, groups: Sequence[Sequence[int]]) -> Forms:
     """Other forms of the effects of a joint fit; `groups` has the trials of each manoeuvre."""
     whole, *less = refitter.drives.simulate(np.stack([fit.values, *without_each(fit, refitter)]))
     motion = motion_of(whole, refitter.drives.features.width)

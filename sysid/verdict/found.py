@@ -12,21 +12,9 @@ from sysid.missing.joint_fit import Refit
 from sysid.verdict.posterior import Findings, Thresholds, posterior
 
 LARGEST = 4  # members of a class
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much is tried."""
-
-    rounds: int = 3
-    """Effects that are searched for one after the other, at most."""
-    candidates: int = 4
-    """Effects refitted in a round, of each scan; pairs refitted; effects that might imitate the best one."""
-    weighed: int = 2
-    """Sets of a round that are weighed, at most: those that gain most."""
-
-
-EFFORT = Effort()
+ROUNDS = 3  # effects that are searched for one after the other, at most
+CANDIDATES = 4  # effects refitted in a round, of each scan; pairs refitted; effects that might imitate the best one
+WEIGHED = 2  # sets of a round that are weighed, at most: those that gain most
 
 
 @dataclass
@@ -34,10 +22,8 @@ class Candidate:
     """One refitted hypothesis of a round."""
 
     hypothesis: Hypothesis
-    gain: float
-    """By how much it lowers the cost, refitted."""
-    p: float
-    """Family-wise, of that gain."""
+    gain: float  # by how much it lowers the cost, refitted
+    p: float  # family-wise, of that gain
     share: float
     refit: Refit
 
@@ -53,19 +39,14 @@ class Search:
     rounds: list[list[Candidate]] = field(default_factory=list)
     accepted: list[Candidate] = field(default_factory=list)
     classes: list[list[str]] = field(default_factory=list)
-    crowd: list[str] = field(default_factory=list)
-    """Effects that look alike too, beyond the `LARGEST` nearest of a class."""
+    crowd: list[str] = field(default_factory=list)  # that look alike too, beyond `LARGEST`
     share: float = 0.0
-    excess: tuple[float, float] = (0.0, 0.0)
-    """Squared white residual over its number, less 1: before and after."""
+    excess: tuple[float, float] = (0.0, 0.0)  # squared white residual over its number, less 1: before and after
     reason: str = ""
     pairs: PairScan | None = None
-    together: float | None = None
-    """Where two effects were accepted as a pair: the p-value of the scan of pairs, or of the weaker one's refit."""
-    findings: Findings | None = None
-    """The numbers that the verdict was reached from; None for drives that stand alone."""
-    weights: dict[str, float] = field(default_factory=dict)
-    """Posterior weights (`sysid.verdict.posterior.Posterior`)."""
+    together: float | None = None  # p-value of the scan of pairs, or of the weaker refit, where a pair was accepted
+    findings: Findings | None = None  # the numbers that the verdict was reached from; None for drives that stand alone
+    weights: dict[str, float] = field(default_factory=dict)  # posterior weights (`sysid.verdict.posterior.Posterior`)
 
     def judged(self, findings: Findings, thresholds: Thresholds) -> Search:
         """This search, with the verdict that its findings come to."""
@@ -105,17 +86,20 @@ class Scan:
 
 
 def tail(null: np.ndarray, value: np.ndarray | float, least: float = 1e-9) -> np.ndarray:
-    """P(null >= value); beyond the draws (N,) by an exponential tail through their upper tenth.
-
-    Args:
-        least: value over which that tail falls by e, at least.
-    """
+    """P(null >= value); beyond the draws (N,) by an exponential tail through their upper tenth, which falls by e over
+    `least` or more."""
     value, ordered = np.asarray(value, float), np.sort(null)
     count = len(ordered)
     empirical = (count - np.searchsorted(ordered, value, side="left") + 1) / (count + 1)
     top = ordered[int(0.9 * count) :]
     far = 0.1 * np.exp(-np.maximum(value - top[0], 0.0) / max(float(top.mean() - top[0]), least))
     return np.asarray(np.where(value > top[len(top) // 2], np.maximum(far, 1e-300), empirical))
+
+
+def tails(null: np.ndarray, values: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """(..., H) `tail` of values (..., H), each of its own draws (N, H)."""
+    each = [tail(null[:, h], values[..., h], least) for h in range(null.shape[1])]
+    return np.moveaxis(np.array(each).reshape(-1, *values.shape[:-1]), 0, -1)
 
 
 def family(smallest: np.ndarray, p: float) -> float:
@@ -154,8 +138,7 @@ class NullRefits:
     """What was found in N simulated days with nothing missing."""
 
     p: np.ndarray  # (N,) what `Search.p_value` would be
-    alarms: int
-    """How many of them would not have been called `none`."""
+    alarms: int  # how many of them would not have been called `none`
 
     def p_of(self, p: float) -> float:
         """Share of days with nothing in them whose p-value is as small, the drives in question counted in."""

@@ -75,9 +75,7 @@ def yaw_rates(log: Log) -> Rates | None:
 def residuals(result: Result, values: np.ndarray) -> np.ndarray:
     """White residuals (N, B, n) of the binned drives with values (N, all)."""
     reference = result.reference
-    drives, before = drives_of(result, result.log.training, reference.params)
-    at = drives.simulate(before[None])[0]
-    drives = drives.weighted(at, reference.factors, result.log.spec.track)
+    drives, _ = result.prepared.drives(result.log.training, result.log.spec.track)
     target = reference.target_of(drives)
     return np.stack([reference.whitener.flat(target - one, drives.mask) for one in drives.simulate(values)])
 

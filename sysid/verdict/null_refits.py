@@ -20,14 +20,12 @@ from sysid.missing.refit import ITERATIONS, Refitter, side_by_side
 from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
-from sysid.verdict.found import NullRefits, PairScan, Search, tail
-from sysid.verdict.pairs import scan_again
+from sysid.verdict.found import NullRefits, PairScan, Search, tails
 from sysid.verdict.posterior import Thresholds, posterior
 from sysid.verdict.rounds import Asked
-from sysid.verdict.scan import best, drawn_away
+from sysid.verdict.scan import best, drawn_away, scan_again
 
-TOGETHER, ACCELERATED = 16, 100
-"""Days whose base fits advance side by side on a processor, and on an accelerator."""
+TOGETHER, ACCELERATED = 16, 100  # days whose base fits advance side by side on a processor, and on an accelerator
 
 
 def run(
@@ -48,9 +46,8 @@ def run(
     for n, (one, base) in enumerate(_days(asked.refitter, factor, rng, count)):
         around = at_fit(asked.evidence, base.residual, base.jacobian, base.u - reference.u)
         gain, worth, q = best(Solver(around), hypotheses, wander)
-        p_each = np.array([tail(scan.null[:, h], worth[h]) for h in range(len(hypotheses))])
         day = replace(asked, evidence=around, refitter=one, base=base, far=None, report=lambda _: None,
-                      scan=replace(scan, gain=gain, worth=worth, q=q, p=p_each))
+                      scan=replace(scan, gain=gain, worth=worth, q=q, p=tails(scan.null, worth)))
         found = judge(day, None if pairs is None else scan_again(pairs, around, hypotheses, wander))
         p[n] = found.p_value
         alarms += found.verdict != "none"

@@ -23,17 +23,17 @@ from sysid.missing.signatures import gather
 from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
 from sysid.verdict.alone import search_alone, stands_alone
-from sysid.verdict.floor import floor_change
+from sysid.verdict.falsification import put_to_test
 from sysid.verdict.found import PairScan, Search
-from sysid.verdict.guards import guarded, stand
 from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
+from sysid.verdict.posterior import Thresholds, contradicted
 from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Support
 from sysid.verdict.rounds import Asked, begin
 from sysid.verdict.search import pairs_of, settle
-from sysid.verdict.sensor_noise import compared, with_noise
+from sysid.verdict.surroundings import floor_change, noise_change, with_noise
 
 
 def find_missing(
@@ -60,7 +60,9 @@ def find_missing(
     fitted = time.perf_counter()
     seen = _look(log, ready.without(config.without), config, progress)
     gathered = time.perf_counter()
-    asked, reference = _asked(log, seen, config, progress), seen.ready.reference
+    reference = seen.ready.reference
+    anything = partial(best_gain, log.training, log.spec, width=reference.width, channels=reference.channels)
+    asked = begin(seen.evidence, seen.ready, seen.refitter, config, anything, progress)
     alone = stands_alone(log.training, reference.known)
     judge: Callable[[Asked, PairScan | None], Search] = settle
     if alone:
@@ -95,10 +97,8 @@ def find_missing(
 class Seen:
     """What some drives show, before anything is searched for in them."""
 
-    ready: Prepared
-    """Where their noise is another one, with that noise."""
-    usual: Wander
-    """At the noise of the reference days."""
+    ready: Prepared  # where their noise is another one, with that noise
+    usual: Wander  # at the noise of the reference days
     noise: NoiseLevels | None
     evidence: Evidence
     refitter: Refitter
@@ -107,20 +107,10 @@ class Seen:
 def _look(log: Log, ready: Prepared, config: LoopConfig, progress: Progress | None) -> Seen:
     """Noise and signatures of the training trials."""
     drives, at = ready.drives(log.training, log.spec.track)
-    noise = compared(drives, at, ready.reference, config.thresholds.alpha)
+    noise = noise_change(drives, at, ready.reference, config.thresholds.alpha)
     usual, ready = ready.wander, with_noise(ready, noise)
     evidence, slopes = gather(drives, ready.reference, ready.hypotheses, ready.full, progress)
     return Seen(ready, usual, noise, evidence, Refitter(drives, ready.reference, ready.values, slopes))
-
-
-def _asked(log: Log, seen: Seen, config: LoopConfig, progress: Progress | None) -> Asked:
-    """What is searched for in the drives."""
-    reference = seen.ready.reference
-
-    def anything(residual: np.ndarray) -> float:
-        return best_gain(log.training, log.spec, residual, reference.width, reference.channels)
-
-    return begin(seen.evidence, seen.ready, seen.refitter, config, anything, progress)
 
 
 def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: Any = None) -> Result:
@@ -128,13 +118,10 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
     if vehicle is not None:
         vehicle = replace(vehicle, kept=not references)
     kept = vehicle is not None and vehicle.kept
-    progress, close = command_line.progress_bar(
-        expected_steps(config, len(days_of(references)), kept), "close the loop")
-    progress(0, "reference vehicle")
-    try:
+    steps = expected_steps(config, len(days_of(references)), kept)
+    with command_line.progress_bar(steps, "close the loop") as progress:
+        progress(0, "reference vehicle")
         return find_missing(log, references, config, vehicle, progress)
-    finally:
-        close()
 
 
 def content_of(trial: Trial) -> str:
@@ -170,3 +157,25 @@ def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
         check_same_vehicle(log, other.spec, f"reference {other.name!r}", "A reference must be a drive of the same "
                                                                          "vehicle")
 
+
+def stand(
+    found: Search, refitter: Refitter, trials: Sequence[Trial], groups: Sequence[Sequence[int]], track: float,
+    p_excess: Callable[[float], float],
+) -> list[Support]:
+    """The evidence for each effect of the final fit, in its order."""
+    fit = found.final
+    tested = put_to_test(fit, refitter, trials, groups, track, p_excess)
+    return [Support.of(fit, part, groups, refitter.precision, one.effect, tuple(mine))
+            for one, part, mine in zip(fit.hypotheses, fit.parts, tested, strict=True)]
+
+
+def guarded(found: Search, stood: Sequence[Support], thresholds: Thresholds) -> Search:
+    """The search without a name where one of its effects is contradicted."""
+    named = {one.hypothesis.effect for one in found.accepted}
+    against = [each for one in stood if one.effect in named for each in one.against(thresholds)]
+    if found.findings is not None:
+        return found.judged(found.findings.put_to_test([one.hypothesis.effect for one in found.accepted], against),
+                            thresholds)
+    if against:
+        found.verdict, found.reason = "unexplained", contradicted(named, found.share, against)
+    return found

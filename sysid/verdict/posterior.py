@@ -24,8 +24,7 @@ NOTHING = "nothing stands out of the noise and the day-to-day spread"
 UNSURE = "what stands out outweighs neither the noise nor what days differ by"
 KIND = "sysid-evidence"
 AGAIN = "Give evidence.json of a run of sysid.close_loop."
-MOST = 2
-"""Effects that are named together. A third one is only tried to see whether the first stood in for two."""
+MOST = 2  # effects that are named together. A third one is only tried to see whether the first stood in for two
 
 
 @dataclass(frozen=True)
@@ -57,37 +56,26 @@ class Thresholds:
 class Left:
     """What a fit leaves, in squares of the white residual."""
 
-    excess: float
-    """Over what days with nothing missing leave, less 1."""
-    common: float
-    """The same of what replicates have in common."""
-    smooth: float
-    """By how much the best smooth functions lower the sum on drives that were held back from them."""
+    excess: float  # over what days with nothing missing leave, less 1
+    common: float  # the same of what replicates have in common
+    smooth: float  # by how much the best smooth functions lower the sum on drives that were held back from them
 
 
 @dataclass(frozen=True)
 class TriedSet:
     """Effects that were refitted together with the base parameters, in numbers."""
 
-    effects: tuple[str, ...]
-    """Names of the effects."""
-    variants: tuple[str, ...]
-    """Their hypotheses."""
-    coordinates: tuple[float, ...]
-    """Fitted, one hypothesis after the other."""
-    gain: float
-    """By how much they lower the cost of the base fit."""
-    p: tuple[float, ...]
-    """Of each effect beside other forms of the others, family-wise; what these forms leave counts as noise."""
+    effects: tuple[str, ...]  # names of the effects
+    variants: tuple[str, ...]  # their hypotheses
+    coordinates: tuple[float, ...]  # fitted, one hypothesis after the other
+    gain: float  # by how much they lower the cost of the base fit
+    p: tuple[float, ...]  # of each effect beside other forms of the others, family-wise; what these leave is noise
     left: Left
-    own: tuple[float, ...]
-    """By how much each effect lowers the cost beside other forms of the others."""
+    own: tuple[float, ...]  # by how much each effect lowers the cost beside other forms of the others
     foretold: tuple[float, ...]
     """Lower 95 % end of how much each effect so raises the log density of manoeuvres that the others predict."""
-    bent: Left
-    """What is left where all may have other forms."""
-    classes: tuple[tuple[str, ...], ...]
-    """Each effect with those that the drives do not separate from it, nearest first."""
+    bent: Left  # what is left where all may have other forms
+    classes: tuple[tuple[str, ...], ...]  # each effect with those not separated from it, nearest first
 
     def apart(self) -> list[list[str]]:
         """The classes, each without what is named beside it."""
@@ -99,26 +87,18 @@ class TriedSet:
 class Findings:
     """All that the verdict is a function of."""
 
-    excess: float
-    """Of the base fit, as `Left.excess`."""
-    p_scan: float
-    """Of the scan of effects."""
-    p_pairs: float | None
-    """Of the scan of pairs; None where there was none."""
-    count: float
-    """Squared white residual where nothing is missing."""
+    excess: float  # of the base fit, as `Left.excess`
+    p_scan: float  # of the scan of effects
+    p_pairs: float | None  # of the scan of pairs; None where there was none
+    count: float  # squared white residual where nothing is missing
     trials: int
-    day: float
-    """Standard deviation of the excess from day to day."""
-    freedom: float
-    """Degrees of freedom that it rests on."""
-    usual: float
-    """What smooth functions gain on a reference day, per trial."""
+    day: float  # standard deviation of the excess from day to day
+    freedom: float  # degrees of freedom that it rests on
+    usual: float  # what smooth functions gain on a reference day, per trial
     sets: tuple[TriedSet, ...] = ()
     against: dict[str, list[str]] = field(default_factory=dict)
     """Names of a set, joined by "+" -> what contradicts them. A set that is not there was not put to the test."""
-    noise: tuple[str, ...] = ()
-    """Channels that are surely noisier or quieter than on the reference days."""
+    noise: tuple[str, ...] = ()  # channels that are surely noisier or quieter than on the reference days
 
     def p_excess(self, excess: float) -> float:
         """Probability of so much excess on a day with nothing in it."""
@@ -141,11 +121,8 @@ class Findings:
         return replace(self, against={**self.against, "+".join(effects): list(against)})
 
     def predictable(self, left: Left, random: float, alpha: float) -> dict[str, float]:
-        """What is left though it could be predicted, by what shows it.
-
-        Args:
-            random: share of what nothing predicts that counts as well (effects may act at random in part).
-        """
+        """What is left though it could be predicted, by what shows it; `random`: share of what nothing predicts that
+        counts as well (effects may act at random in part)."""
         found = {"smooth": left.smooth - self.usual * self.trials}
         if self.p_excess(left.common) < alpha:
             found["common"] = left.common * self.count
@@ -191,14 +168,10 @@ class Posterior:
     """What the findings come to."""
 
     verdict: str
-    chosen: int | None
-    """Number of the set that explains most; of `Findings.sets`."""
-    share: float
-    """That it explains of what can be explained."""
+    chosen: int | None  # number of the set that explains most; of `Findings.sets`
+    share: float  # that it explains of what can be explained
     reason: str
-    weights: dict[str, float]
-    """Of `none`, `noise` (nothing but other noise), `unknown` and of sets of effects (names joined by " + "): 1 in
-    all."""
+    weights: dict[str, float]  # of `none` or `noise`, `unknown` and sets of effects (joined by " + "): 1 in all
 
 
 def posterior(findings: Findings, priors: Thresholds) -> Posterior:
@@ -250,10 +223,8 @@ def _log_weights(findings: Findings, priors: Thresholds, best: TriedSet | None) 
 
 
 def choose(findings: Findings, priors: Thresholds) -> int | None:
-    """The number of the set of the largest posterior weight, if there is any.
-
-    Every effect of it must be more than another form of the others.
-    """
+    """The number of the set of the largest posterior weight, of which every effect is more than another form of the
+    others, if there is any."""
     able = [i for i, one in enumerate(findings.sets) if findings.able(one, priors)]
     return max(able, key=lambda i: findings.log_weight(findings.sets[i].gain, len(findings.sets[i].effects), priors),
                default=None)
@@ -271,11 +242,7 @@ def as_json(findings: Findings) -> dict[str, Any]:
 
 
 def from_json(content: dict[str, Any], where: str = "findings") -> Findings:
-    """The findings of a file.
-
-    Raises:
-        ValueError: if there is a value of another kind, or a set whose lists are not of one length.
-    """
+    """The findings of a file; ValueError for a value of another kind, or a set whose lists are not of one length."""
     known = _of(Findings, content)  # older files have more
     if isinstance(sets := known.get("sets"), list):
         known["sets"] = [_of(TriedSet, one) if isinstance(one, dict) else one for one in sets]
@@ -297,11 +264,7 @@ def _of(kind: type, content: dict[str, Any]) -> dict[str, Any]:
 
 
 def read(path: Path) -> Findings:
-    """The findings of a file that `sysid.close_loop` or `benchmarks.undeclared` kept.
-
-    Raises:
-        ValueError: if it is none.
-    """
+    """The findings of a file that `sysid.close_loop` or `benchmarks.undeclared` kept; ValueError if it is none."""
     content = upgraded(KIND, read_json(path, f"no such file. {AGAIN}", AGAIN))
     if content.get("kind") != KIND or content.get("schema") != FORMATS[KIND].schema:
         raise ValueError(f"{path}: kind {shown(content.get('kind'))}, schema {shown(content.get('schema'))}; this "

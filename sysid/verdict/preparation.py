@@ -22,15 +22,14 @@ from sysid.replay.models import gyro_effects, with_effects
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.search.result import Progress
-from sysid.verdict.found import EFFORT
+from sysid.verdict.found import ROUNDS
 from sysid.verdict.result import LoopConfig, Prepared
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
 
-BLOCKS = 8
-"""Of a long reference run, as of a log that stands alone (`sysid.missing.signatures.manoeuvre_groups`)."""
+BLOCKS = 8  # of a long reference run, as of a log that stands alone (`sysid.missing.signatures.manoeuvre_groups`)
 LEAST_WINDOWS = 3  # of a block, so that a fit to it is not that of one window's noise
 
 
@@ -66,7 +65,7 @@ def _plant(spec: VehicleSpec, config: LoopConfig) -> Plant:
 def expected_steps(config: LoopConfig, days: int, fitted: bool = False) -> int:
     """How far the progress bar goes at most, with so many reference days."""
     base = 0 if fitted else config.base_iterations + max(config.base_iterations // 2, 3)
-    return base + 6 * days + 2 * PARTS + 4 + 3 * (2 * EFFORT.rounds + 1) + config.refit_nulls
+    return base + 6 * days + 2 * PARTS + 4 + 3 * (2 * ROUNDS + 1) + config.refit_nulls
 
 
 def days_of(references: Sequence[Log]) -> tuple[Log, ...]:

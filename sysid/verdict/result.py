@@ -16,9 +16,10 @@ from sysid.missing.catalogue import Hypothesis, base_values
 from sysid.missing.days import Reference, Wander
 from sysid.missing.drives import Drives, make_drives
 from sysid.missing.evidence import Evidence, column_layout
+from sysid.missing.joint_fit import Refit
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay
-from sysid.verdict.agreement import Heterogeneity
+from sysid.verdict.agreement import Heterogeneity, foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import Tested, in_words
 from sysid.verdict.found import NullRefits, Search
 from sysid.verdict.posterior import Thresholds
@@ -34,9 +35,16 @@ class Support:
     errors: np.ndarray  # (G,) their standard errors
     agreement: Heterogeneity
     foretold: np.ndarray  # (G,) squared residual that the others' fit saves each manoeuvre
-    interval: tuple[float, float]
-    """95 % of the sum of it, manoeuvres drawn anew."""
+    interval: tuple[float, float]  # 95 % of the sum of it, manoeuvres drawn anew
     falsifiers: tuple[Tested, ...]
+
+    @classmethod
+    def of(cls, fit: Refit, part: slice, groups: Sequence[Sequence[int]], precision: np.ndarray, effect: str,
+           falsifiers: tuple[Tested, ...] = ()) -> Support:
+        """That of an effect whose coordinates are `part` of q; `groups`: trials of each manoeuvre."""
+        sizes, errors = sizes_apart(fit, part, groups, precision)
+        gains = foretold(fit, part, groups, precision)
+        return cls(effect, sizes, errors, heterogeneity(sizes, errors), gains, interval_of_sum(gains), falsifiers)
 
     def against(self, thresholds: Thresholds) -> list[str]:
         """What contradicts the effect, in words."""
@@ -101,13 +109,11 @@ class Prepared:
     reference: Reference
     plant: Plant
     hypotheses: tuple[Hypothesis, ...]
-    full: Any
-    """The vehicle with the whole catalogue at neutral."""
+    full: Any  # the vehicle with the whole catalogue at neutral
     names: tuple[str, ...]
     paths: PathReplay
     wander: Wander
-    others: dict[Any, PathReplay] = field(default_factory=dict)
-    """Compiled replays of vehicles with effects that the catalogue does not have, by plant and structure."""
+    others: dict[Any, PathReplay] = field(default_factory=dict)  # compiled replays of vehicles with other effects
 
     @property
     def vehicle(self) -> FreeVehicle:
@@ -151,34 +157,26 @@ class Result:
     evidence: Evidence
     seconds: dict[str, float]
     null_refits: NullRefits | None = None
-    stood: tuple[Support, ...] = ()
-    """What speaks for and against each effect of the final fit; empty where nothing was about to be named."""
-    noise: NoiseLevels | None = None
-    """Noise of each channel over that of the reference days; None without such days."""
-    floor: FloorChange | None = None
-    """Whether the floor is another than on the reference days; None where nothing could show it."""
+    stood: tuple[Support, ...] = ()  # for and against each effect of the final fit, where one was about to be named
+    noise: NoiseLevels | None = None  # noise of each channel over that of the reference days; None without such days
+    floor: FloorChange | None = None  # beside that of the reference days; None where nothing could show it
 
     @property
     def reference(self) -> Reference:
-        """The vehicle as it was."""
         return self.prepared.reference
 
     @property
     def plant(self) -> Plant:
-        """What replays it."""
         return self.prepared.plant
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """What was tried."""
         return self.prepared.hypotheses
 
     @property
     def full(self) -> Any:
-        """The vehicle with the whole catalogue at neutral."""
         return self.prepared.full
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Its parameters."""
         return self.prepared.names

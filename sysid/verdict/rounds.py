@@ -15,48 +15,38 @@ from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
 from sysid.verdict.agreement import beside, foretold
-from sysid.verdict.classes import imitation
-from sysid.verdict.found import EFFORT, Candidate, PairScan, Scan, Search
+from sysid.verdict.found import CANDIDATES, WEIGHED, Candidate, PairScan, Scan, Search
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import LoopConfig, Prepared
-from sysid.verdict.scan import best, run
+from sysid.verdict.scan import best, imitation, run
 
 FIRST_LOOK, POLISH, TO_ITS_END = 4, 8, 60
-"""Iterations at most of a refit for every candidate, of one that starts again, and of what is compared or built on.
-
-Fits end by themselves long before the last number where the base lies near the reference. Of drives that stand alone
-the base may go far: cut short, the next effect would be credited with what the fit before it had not yet found."""
-ELSEWHERE = (1.0, 3.0)
-"""Factors on an effect's size from which a fit that ended at the end of a range starts anew."""
+"""Iterations at most of a refit for every candidate, of one that starts again, and of what is compared or built on: cut
+short, the next effect would be credited with what the fit before it had not yet found."""
+ELSEWHERE = (1.0, 3.0)  # factors on an effect's size from which a fit that ended at the end of a range starts anew
 NEARER = (0.3, 0.1, 0.03)
 """Shares of an effect's coordinates from which a fit starts where the whole of them fit no better than none."""
-SIDE = 2.0
-"""Coordinate from which such a fit starts on either side of what only changes the effect."""
-Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]
-"""Gain (H,), worth (H,) and coordinates of every hypothesis."""
+SIDE = 2.0  # coordinate from which such a fit starts on either side of what only changes the effect
+Looked = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]  # gain (H,), worth (H,), coordinates
 
 
 @dataclass(frozen=True)
 class Asked:
     """What a search asks of some drives, and the base fit that it begins with."""
 
-    evidence: Evidence
-    """Around the base fit."""
+    evidence: Evidence  # around the base fit
     hypotheses: Sequence[Hypothesis]
     refitter: Refitter
     wander: Wander
     thresholds: Thresholds
     base: Refit
-    scan: Scan
-    """Of all hypotheses beside the base."""
+    scan: Scan  # of all hypotheses beside the base
     similar: np.ndarray  # (H, H) |cos| of signatures
     anything: Callable[[np.ndarray], float] = lambda _: 0.0
     """By how much the best of the smooth functions that know no physics lowers the sum of squares of a white residual
     (B, n), on drives held back from it."""
-    report: Callable[[str], None] = lambda _: None
-    """Says what was just done."""
-    far: Looked | None = None
-    """A scan around the reference: a large effect shows best there."""
+    report: Callable[[str], None] = lambda _: None  # says what was just done
+    far: Looked | None = None  # a scan around the reference: a large effect shows best there
     named: Callable[[str], bool] = lambda _: True
     """Whether these drives could show an effect to be what it is. Others are looked for beside, not in their place."""
 
@@ -68,10 +58,6 @@ class Asked:
     def excess(self, residual: np.ndarray) -> float:
         """Squared white residual (B, n) over its number of values, less 1."""
         return float(np.square(residual).sum()) / self.count - 1
-
-    def p_left(self, residual: np.ndarray) -> float:
-        """Probability of so much excess on a day with nothing missing."""
-        return self.wander.p_excess(self.excess(residual))
 
     def explained(self, fit: Refit) -> float:
         """Share of the base fit's excess that a fit removes; where there is hardly any, of what a day's varies by."""
@@ -173,20 +159,20 @@ def _starts(
     """Hypotheses out of `left` to refit and where to start.
 
     Of each scan those that gain most of what stands out, what gains most whether it does or not, and of the last the
-    one that stands out most. A large effect shows best in the scan around the reference, a small one in that around the
-    base refitted to these drives. What wanders from day to day stands out less than what imitates it.
+    one that stands out most. A large effect shows best in the scan around the reference, a small one around the base
+    refitted to these drives.
     """
     order: dict[str, tuple[int, np.ndarray]] = {}
     for number, (gain, worth, q) in enumerate(scans):
         standing = [h for h in left if worth[h] > 0 and first.p_of(h, float(worth[h])) < thresholds.alpha]
         chosen = sorted(standing, key=lambda h: -gain[h])
         if number == len(scans) - 1:
-            chosen = [*chosen[: EFFORT.candidates], *sorted(left, key=lambda h: -worth[h])[:1]]
+            chosen = [*chosen[:CANDIDATES], *sorted(left, key=lambda h: -worth[h])[:1]]
         new = 0
         most = [h for h in sorted(left, key=lambda h: -gain[h])[:1] if gain[h] > 0]
         for h in [*chosen, *most]:
             wide, start = _widest(hypotheses, h, q, standing)
-            if hypotheses[wide].key not in order and (new < EFFORT.candidates or h not in chosen):
+            if hypotheses[wide].key not in order and (new < CANDIDATES or h not in chosen):
                 order[hypotheses[wide].key] = (wide, start)
                 new += 1
     return list(order.values())
@@ -206,7 +192,7 @@ def _rivals(
         if alike[h] > 0 and hypotheses[h].effect not in done:
             done.add(hypotheses[h].effect)
             out.append(int(h))
-    return out[: EFFORT.candidates]
+    return out[:CANDIDATES]
 
 
 def elsewhere(refitter: Refitter, fit: Refit, before: int) -> list[Start]:
@@ -270,10 +256,8 @@ def p_of_last(asked: Asked, fit: Refit, gain: float) -> float:
 
 
 def pair_round(asked: Asked, pairs: PairScan, tried: set[str]) -> list[tuple[list[Candidate], float]]:
-    """Pairs that gain more together than any effect alone, refitted; the best first.
-
-    Args:
-        tried: effects whose pairs had their chance, with the other one as a further effect.
+    """Pairs that gain more together than any effect alone, refitted; the best first. Pairs of effects that were `tried`
+    had their chance.
 
     Returns:
         Of each pair its two effects, the one that explains more by itself first and the refit of both last; and the
@@ -289,9 +273,9 @@ def pair_round(asked: Asked, pairs: PairScan, tried: set[str]) -> list[tuple[lis
             seen.add(names)
             order.append(int(m))
     starts = [Start(tuple(hypotheses[h] for h in pairs.members[m]), asked.base.u, pairs.q[m])
-              for m in order[: EFFORT.candidates]]
+              for m in order[:CANDIDATES]]
     out = []
-    for both in sorted(refitter.fit_all(starts, FIRST_LOOK + POLISH), key=lambda fit: fit.cost)[: EFFORT.weighed]:
+    for both in sorted(refitter.fit_all(starts, FIRST_LOOK + POLISH), key=lambda fit: fit.cost)[:WEIGHED]:
         alone = refitter.fit_all([Start((one,), both.u, q) for one, q in zip(both.hypotheses, both.split, strict=True)],
                                  POLISH)
         if alone[0].cost > alone[1].cost:  # the one that explains more by itself comes first

@@ -11,8 +11,7 @@ from sysid.missing.evidence import Solver, at_fit
 from sysid.missing.joint_fit import Start, moved_last
 from sysid.verdict.agreement import interval_of_sum
 from sysid.verdict.forms import forms_of
-from sysid.verdict.found import EFFORT, LARGEST, Candidate, PairScan, Search
-from sysid.verdict.pairs import DRAWS, scan_pairs
+from sysid.verdict.found import LARGEST, ROUNDS, WEIGHED, Candidate, PairScan, Search
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
 from sysid.verdict.rounds import (
     POLISH,
@@ -25,7 +24,7 @@ from sysid.verdict.rounds import (
     p_of_last,
     pair_round,
 )  # fmt: skip
-from sysid.verdict.scan import best, null_days
+from sysid.verdict.scan import DRAWS, best, null_days, scan_pairs
 
 
 @dataclass(frozen=True)
@@ -33,12 +32,9 @@ class Weighed:
     """A set of effects that were refitted together, and what it was found among."""
 
     numbers: TriedSet
-    members: tuple[Candidate, ...]
-    """The refit of all is the last one's."""
-    rivals: tuple[Sequence[Candidate], ...]
-    """What was refitted in the place of each."""
-    together: float | None = None
-    """p-value of "nothing is missing" where it was found as a pair."""
+    members: tuple[Candidate, ...]  # the refit of all is the last one's
+    rivals: tuple[Sequence[Candidate], ...]  # what was refitted in the place of each
+    together: float | None = None  # p-value of "nothing is missing" where it was found as a pair
 
 
 def pairs_of(asked: Asked, seed: int = 0) -> PairScan:
@@ -74,16 +70,16 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
     """Effects one after the other, as long as more is left than days differ by, or any stands out beside them."""
     current, members, rivals = asked.base, tuple[Candidate, ...](), tuple[Sequence[Candidate], ...]()
     out: list[Weighed] = []
-    for _ in range(EFFORT.rounds):
+    for _ in range(ROUNDS):
         candidates = candidates_of(asked, found, current)
         apart = {one.hypothesis.effect: one for one in reversed(candidates) if one.p < asked.thresholds.alpha}
         likely = sorted(apart.values(), key=lambda one: -one.gain)  # of several forms of an effect the best one
-        new = [_weighed(asked, (*members, one), (*rivals, candidates)) for one in likely[: EFFORT.weighed]]
+        new = [_weighed(asked, (*members, one), (*rivals, candidates)) for one in likely[:WEIGHED]]
         out += new
         able = [one for one in new if findings.able(one.numbers, asked.thresholds)]
         if len(members) == 2:
             out += [each for one in new[:1] for each in _without_stand_ins(asked, one)]
-        if not able or (asked.p_left(able[0].members[-1].refit.residual) >= asked.thresholds.alpha
+        if not able or (asked.wander.p_excess(able[0].numbers.left.excess) >= asked.thresholds.alpha
                         and not more_stands_out(asked, able[0])):
             break
         members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
@@ -98,7 +94,7 @@ def _in_their_place(asked: Asked, found: Search, findings: Findings, weighed: Se
     able = [one for one in weighed if findings.able(one.numbers, asked.thresholds)]
     pairs = [one for one in able if len(one.members) == 2]
     best = max(pairs, key=lambda one: one.numbers.gain, default=None)
-    if best is None or asked.p_left(best.members[-1].refit.residual) >= asked.thresholds.alpha:
+    if best is None or asked.wander.p_excess(best.numbers.left.excess) >= asked.thresholds.alpha:
         return list(weighed)
     starts = [one.members[0] for one in [one for one in able if len(one.members) == 1][1:2]]
     last = best.members[-1]
@@ -108,7 +104,7 @@ def _in_their_place(asked: Asked, found: Search, findings: Findings, weighed: Se
         beside[first.hypothesis.effect] = candidates = candidates_of(asked, found, first.refit)
         likely = {one.hypothesis.effect: one for one in reversed(candidates) if one.p < asked.thresholds.alpha}
         fresh = [one for name, one in likely.items() if frozenset((first.hypothesis.effect, name)) not in tried]
-        new = sorted(fresh, key=lambda one: -one.gain)[: EFFORT.weighed]
+        new = sorted(fresh, key=lambda one: -one.gain)[:WEIGHED]
         tried |= {frozenset((first.hypothesis.effect, one.hypothesis.effect)) for one in new}
         out += [_weighed(asked, (first, one), (found.rounds[0], candidates)) for one in new]
     alone = {one.hypothesis.effect: one.gain for one in (*reversed(found.rounds[0]), *starts)}
@@ -163,7 +159,7 @@ def _without_stand_ins(asked: Asked, one: Weighed) -> list[Weighed]:
     final, out = one.members[-1].refit, []
     for number in range(len(one.members) - 1):
         place = final.hypotheses.index(one.members[number].hypothesis)
-        q = np.concatenate([part for i, part in enumerate(final.split) if i != place])
+        q = np.delete(final.q, final.parts[place])
         kept = (*final.hypotheses[:place], *final.hypotheses[place + 1 :])
         [without] = asked.refitter.fit_all([Start(kept, final.u, q)], POLISH)
         members = tuple(each for i, each in enumerate(one.members) if i != number)

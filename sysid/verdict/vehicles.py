@@ -46,11 +46,9 @@ def vehicle_after(result: Result) -> Any:
 def refit_poses(result: Result, vehicle: Any, iterations: int = 12) -> Any:
     """A vehicle refitted to whole poses and speeds, as `sysid.fit` does, from where the search left it.
 
-    The search weighs short motions, which separate effects; poses show what adds up over a whole drive. The
-    refit may move base parameters and the accepted effects' own, and against a reference what every fit to poses has
-    besides (`measured_effects`, without the losses, which may be what is asked for): the search takes their part for
-    the wander of days. Drives without one would only be fitted closer by them: on a measured robot the errors of drives
-    left out grew by 3 %.
+    Base parameters may move and the accepted effects' own, and against a reference what every fit to poses has besides
+    (`measured_effects` without the losses, which may be what is asked for): the search takes their part for the wander
+    of days.
     """
     known, trials = result.reference.known, result.log.training
     extra = measured_effects(vehicle, result.log.spec, trials, losses=False) if known else ()
@@ -101,7 +99,7 @@ def drives_of(result: Result, trials: tuple[Trial, ...], vehicle: Any) -> tuple[
     """Trials as a vehicle replays them, and the values (all,) of its parameters there.
 
     They go through what was compiled for the search, where the catalogue has all effects of the vehicle, or else
-    through one replay for all vehicles of a result; effects that this vehicle does not have are neutral.
+    through one replay for all vehicles of a result.
     """
     ready, width, values = result.prepared, result.reference.width, base_values(vehicle)
     gyro = result.reference.gyro

@@ -14,12 +14,12 @@ import pytest
 from benchmarks.plant.first_day import SMALL, Day, Wrong, make_uncalibrated, tracked, write_mjcf, write_urdf
 from benchmarks.planted_logs import Schedule, write_dataset
 from sysid.errors.bin_objective import make_features_objective
-from sysid.errors.prior import UNKNOWN, bounds_alone
+from sysid.errors.prior import SPREAD, UNKNOWN, bounds_alone
 from sysid.errors.space import make_space
 from sysid.intervals.uncertainty import Estimate, estimate
 from sysid.logs.log import load_log, make_trial
 from sysid.logs.records import Log, OdometryStream, PoseStream
-from sysid.missing.reference import ASSUMED_SPREAD, assumed_spread
+from sysid.missing.reference import assumed_spread
 from sysid.pages.fit_report import UNKNOWN as NOT_TOLD
 from sysid.pages.fit_report import calibration_notes
 from sysid.replay.mjcf import mjcf_model
@@ -337,7 +337,7 @@ def test_sizes_and_scales_are_not_taken_to_wander_by_a_share_of_their_value(smal
     u = space.to_unit(space.initial)
     linear, common, kp = assumed_spread(space, u) * space.slope(u)
     assert linear < 0.002 and common < 0.002
-    assert kp == pytest.approx(ASSUMED_SPREAD * space.initial[2])
+    assert kp == pytest.approx(SPREAD * space.initial[2])
 
 
 @pytest.mark.quick

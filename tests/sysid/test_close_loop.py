@@ -20,9 +20,9 @@ from sysid.logs.log import load_log
 from sysid.logs.metrics import own_floor, score
 from sysid.missing.catalogue import base_values
 from sysid.missing.drives import make_drives
-from sysid.missing.joint_fit import without_each
-from sysid.pages.loop_errors import replay
+from sysid.missing.refit import without_each
 from sysid.pages.loop_report import effects, make_report, manifest, write_run
+from sysid.pages.loop_tables import replay
 from sysid.pages.loop_words import shifts
 from sysid.replay.models import with_effects
 from sysid.replay.records import Measured

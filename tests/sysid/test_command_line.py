@@ -25,13 +25,10 @@ def test_a_stage_is_said_where_a_command_runs_and_nowhere_else(capsys):
 @pytest.mark.quick
 def test_a_bar_of_a_search_that_ends_early_is_full_and_that_of_a_failure_is_not(capsys):
     def last(fail):
-        advance, close = command_line.progress_bar(36)
-        try:
+        with command_line.progress_bar(36) as advance:
             advance(20, "refits")
             if fail:
                 raise ValueError
-        finally:
-            close()
 
     last(fail=False)
     assert "20/20" in capsys.readouterr().err

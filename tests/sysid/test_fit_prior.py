@@ -19,7 +19,7 @@ from sysid.search import fitting, least_squares
 from sysid.search.settings import FitConfig
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import WHILL_CR
-from whill_mjx.vehicle.vehicle_file import save_vehicle
+from whill_mjx.vehicle.vehicle_file import load_intervals, save_vehicle
 
 U_TRUTH = UNICYCLE_SPACE.to_unit(TRUTH)
 
@@ -84,7 +84,7 @@ def test_a_vehicle_file_of_another_vehicle_is_an_error(tmp_path):
     params = preset_params(WHILL_CR, "physical")
     path = tmp_path / "vehicle.toml"
     save_vehicle(path, WHILL_CR, params, {"torque_drive.kp": (8.0, 9.0)}, {})
-    assert fitting._earlier(path)[1] == {"torque_drive.kp": (8.0, 9.0)}
+    assert load_intervals(path) == {"torque_drive.kp": (8.0, 9.0)}
     other = SimpleNamespace(spec=dataclasses.replace(WHILL_CR, track=0.6), name="there")
     with pytest.raises(ValueError, match="track is .* but 0.6 in 'there'"):
         fitting.of_earlier(other, FitConfig(vehicle=path))

@@ -21,7 +21,7 @@ from sysid.replay.one_drive import Commanded, path_of
 from sysid.replay.rollout import make_batch
 from sysid.verdict import alone, rounds
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
-from sysid.verdict.found import Candidate, Effort
+from sysid.verdict.found import Candidate
 from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
 from sysid.verdict.result import LoopConfig
@@ -228,7 +228,7 @@ def weighed(monkeypatch, gains, class_of, wheels=True):
         found.rounds.append(listed)
         return listed
 
-    monkeypatch.setattr(alone, "EFFORT", Effort(rounds=1))
+    monkeypatch.setattr(alone, "ROUNDS", 1)
     monkeypatch.setattr(alone, "candidates_of", candidates_of)
     monkeypatch.setattr(alone, "held_back", lambda asked, fit: np.array(told[fit.cost]))
     monkeypatch.setattr(alone, "class_of", class_of)
@@ -238,7 +238,7 @@ def weighed(monkeypatch, gains, class_of, wheels=True):
 def test_what_may_have_a_name_is_tried_and_followed_to_its_end_beside_what_gains_more(monkeypatch):
     evidence = drives((0.0, 0.0, 1.0, 0.4))
     asked = asked_of(evidence, Linear(evidence))
-    monkeypatch.setattr(rounds, "EFFORT", Effort(candidates=1))
+    monkeypatch.setattr(rounds, "CANDIDATES", 1)
 
     def tried(asked):
         scan = (asked.scan.gain, asked.scan.worth, asked.scan.q)

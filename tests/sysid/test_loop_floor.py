@@ -12,8 +12,8 @@ from sysid.logs.records import Command, GyroStream, Log, OdometryStream, Start, 
 from sysid.missing.days import Leftover, Reference
 from sysid.missing.reference import BLOCK
 from sysid.verdict import vehicles
-from sysid.verdict.floor import floor_change
 from sysid.verdict.preparation import days_of
+from sysid.verdict.surroundings import floor_change
 from whill_mjx.vehicle.specs import HUSKY
 
 ALPHA = 0.005

@@ -14,7 +14,7 @@ from sysid.verdict.agreement import SCATTER, heterogeneity, interval_of_sum
 from sysid.verdict.falsification import course_of, sizes_in_parts
 from sysid.verdict.falsifiers import QUIET, SPLITS, side
 from sysid.verdict.found import Candidate, Search
-from sysid.verdict.guards import guarded
+from sysid.verdict.pipeline import guarded
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import Support
 from whill_mjx.effects import EFFECTS

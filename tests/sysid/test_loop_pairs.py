@@ -11,14 +11,13 @@ from sysid.follow_up.power import SEED, Days, false_alarms, power_curve
 from sysid.missing.days import no_wander
 from sysid.missing.evidence import column_layout
 from sysid.missing.joint_fit import Refit, moved_last
-from sysid.pages.loop_power import detectable
+from sysid.pages.loop_tables import detectable
 from sysid.verdict import rounds
 from sysid.verdict.found import tail
-from sysid.verdict.pairs import CHI_SQUARED, scan_again, scan_pairs
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import begin
-from sysid.verdict.scan import null_days, run
+from sysid.verdict.scan import CHI_SQUARED, null_days, run, scan_again, scan_pairs
 from sysid.verdict.search import pairs_of as pairs_of_effects
 from sysid.verdict.search import settle
 
@@ -150,7 +149,7 @@ def test_the_smallest_detectable_size_is_noticed_in_four_days_of_five(wander, mo
     evidence = drives(np.zeros(4))
     scan = run(evidence, EFFECTS, SPREAD, wander, 1000)
     days = simulated_days(evidence, wander, scan)
-    monkeypatch.setattr("sysid.pages.loop_power.base_values", lambda _: dict.fromkeys(
+    monkeypatch.setattr("sysid.pages.loop_tables.base_values", lambda _: dict.fromkeys(
         (one.axes[0].parameter for one in EFFECTS), 0.0))
     result = SimpleNamespace(search=SimpleNamespace(scan=scan, findings=None), evidence=evidence, hypotheses=EFFECTS,
                              full=None, prepared=SimpleNamespace(wander=wander),

@@ -12,21 +12,21 @@ from sysid.errors.noise import fit_roughness, fit_whitener
 from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.missing.days import Wander
 from sysid.missing.drives import DRAIN, SESSION, Drives
-from sysid.missing.evidence import Columns
+from sysid.missing.evidence import Columns, column_layout
 from sysid.missing.joint_fit import Refit
 from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
-from sysid.pages.loop_evidence import in_range
 from sysid.pages.loop_page import not_determined
+from sysid.pages.loop_tables import in_range
 from sysid.pages.verdict_picture import account, draw
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import foretold
-from sysid.verdict.classes import imitation
 from sysid.verdict.found import Scan
 from sysid.verdict.posterior import Findings, Left, Thresholds, TriedSet, posterior, read, write
 from sysid.verdict.rounds import Asked
+from sysid.verdict.scan import imitation
 from whill_mjx.effects import about_of
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.presets import preset
@@ -282,9 +282,9 @@ def test_what_only_acts_through_another_axis_has_a_column_of_that_alone():
     def simulate(sets):
         return (sets[:, 0] * (1 + sets[:, 1]))[:, None, None, None]
 
-    columns, listed = signature_columns(SimpleNamespace(simulate=simulate), [one], np.zeros(2), ["some.a", "some.b"],
-                                        np.zeros((1, 1, 1)))
-    [at] = [columns[0, 0, 0, list(each.index)] for each in listed if each.level == 2.0]
+    columns = signature_columns(SimpleNamespace(simulate=simulate), [one], np.zeros(2), ["some.a", "some.b"],
+                                np.zeros((1, 1, 1)))
+    [at] = [columns[0, 0, 0, list(each.index)] for each in column_layout([one], 0) if each.level == 2.0]
     np.testing.assert_allclose(at, [1.0, 2.0])
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sysid.logs.manoeuvre_library import OWN
-from sysid.pages.before_after import Paths, drive_pictures, drive_table, shown_drive
+from sysid.pages.before_after import drive_pictures, drive_table, shown_drive
 from sysid.pages.loop_words import MANOEUVRE_WORDS, lead, sentence, size, title, wrapped
+from sysid.pages.series import Channel, TrialSeries
 
 pytestmark = pytest.mark.quick
 
@@ -90,8 +91,8 @@ def test_three_sentences_say_what_it_is_what_it_changes_and_what_is_open():
 def circle(error, name, held_out):
     t = np.linspace(0, 10, 500)
     path = np.column_stack([np.sin(t), 1 - np.cos(t), t])
-    replays = {"before": path + [error, 0, 0.1], "after": path + [error / 10, 0, 0.0]}
-    return Paths(name, held_out, "ground_truth", t, path, replays)
+    values = {"measured": path, "before": path + [error, 0, 0.1], "after": path + [error / 10, 0, 0.0]}
+    return TrialSeries(name, held_out, (0.0, 0.0, 0.0), {"ground_truth": Channel(t, values)})
 
 
 def test_the_drive_that_is_shown_is_held_out_and_the_one_of_median_error():

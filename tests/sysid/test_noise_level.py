@@ -13,7 +13,7 @@ from sysid.logs.records import Command
 from sysid.missing.days import Leftover, Reference, Wander
 from sysid.missing.signatures import white_leftover
 from sysid.verdict.result import Prepared
-from sysid.verdict.sensor_noise import with_noise
+from sysid.verdict.surroundings import with_noise
 
 pytestmark = pytest.mark.quick
 

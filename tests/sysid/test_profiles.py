@@ -10,7 +10,7 @@ import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
 from sysid.intervals import uncertainty
-from sysid.intervals.profiles import Minimum, Profile, crossings, profile
+from sysid.intervals.profiles import Profile, crossings, profile
 from sysid.pages.fit_page import profiles as profiles_section
 from sysid.search import least_squares
 from sysid.search.fitting import fit_log
@@ -25,7 +25,7 @@ def fitted(objective):
 
 @pytest.fixture(scope="module")
 def traced(objective, fitted):
-    return profile(objective, Minimum(*fitted), objective.space.names, points=7)
+    return profile(objective, fitted[1], objective.space.names, points=7)
 
 
 def test_a_profile_of_well_known_parameters_is_the_interval_from_curvature(traced, fitted, objective):
@@ -70,7 +70,7 @@ def test_a_parameter_that_the_log_does_not_tell_has_an_open_profile(objective, f
                                    (("low", 1.0), ("high", 3.0), ("initial", 2.0), ("log", False))})
     blind = dataclasses.replace(objective, replay=Blind(), space=space)
     u = np.append(fitted[0], 0.5)
-    (one,) = profile(blind, Minimum(u, uncertainty.estimate(blind, u)), ["nothing"], points=3, iterations=3)
+    (one,) = profile(blind, uncertainty.estimate(blind, u), ["nothing"], points=3)
     assert one.interval == (None, None) and (one.values[0], one.values[-1]) == (1.0, 3.0)
     assert one.remark(space) == "open below: even its bound is allowed, open above: even its bound is allowed"
 

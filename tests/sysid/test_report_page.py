@@ -14,7 +14,7 @@ import pytest
 from conftest import TRUTH, unicycle_plant
 
 import sysid.report as report_module
-from sysid.pages import series as series_module
+from sysid.pages import report as report_json
 from sysid.pages.fit_page import autocorrelation, choose, worse
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, read_report, summaries, write_html, write_report
 from sysid.pages.series import Channel, TrialSeries, collect, load, save
@@ -125,9 +125,9 @@ def test_series_come_back_from_their_file(run, unicycle_log):
 
 def test_a_run_without_series_names_the_dataset_that_changed(run, tmp_path, monkeypatch, unicycle_log):
     other = dataclasses.replace(unicycle_log, sha256="other")
-    monkeypatch.setattr("sysid.logs.measured.load_any", lambda *a, **k: other)
+    monkeypatch.setattr("sysid.pages.report.load_any", lambda *a, **k: other)
     with pytest.raises(ValueError, match="nowhere: has changed"):
-        series_module.replay(tmp_path, read_report(run))
+        report_json.replay(tmp_path, read_report(run))
 
 
 def test_what_got_worse_lists_every_error_above_before_and_above_ideal():

@@ -12,7 +12,7 @@ from sysid.errors.pose_objective import Noise
 from sysid.errors.space import Space
 from sysid.intervals import uncertainty
 from sysid.replay.rollout import Replay, make_batch, predictions
-from sysid.search import least_squares, tpe
+from sysid.search import least_squares, studies
 from sysid.search.result import Stages
 from sysid.search.settings import FitConfig
 from sysid.search.valleys import gradient_search
@@ -230,7 +230,7 @@ def test_intervals_of_a_robust_fit_are_not_those_of_its_outliers(objective):
 
 @pytest.mark.parametrize("cost", ["paper", "weighted"])
 def test_tpe_improves_on_the_initial_values(objective, cost):
-    result = tpe.fit(objective, objective.space, tpe.GlobalSearch(64, 0, cost, best=3))
+    result = studies.global_search(objective, objective.space, studies.GlobalSearch(64, 0, cost, best=3))
     assert result.cost < 0.5 * result.initial_cost
     assert result.starts.shape == (3, 3) and (np.diff(result.history) <= 0).all()
 

@@ -43,7 +43,7 @@ def test_slopes_of_a_rippled_plane_are_those_beneath_the_ripples():
     rippled = Rippled(designs(random), np.zeros((DRIVES, SAMPLES)), height=0.02, length=0.05)
     u, smooth = np.full(3, 0.5), designs(np.random.default_rng(0))
     wrong = np.abs(rippled.jacobian(u[None])[1][0] - smooth).max()
-    covariance = slopes.likely(smooth, 1.0)
+    covariance = slopes.likely_by(slopes.products(smooth), 1.0)
     left = np.abs(slopes.average_slopes(rippled, u, covariance)[1] - smooth).max()
     assert wrong > 30 and left < 0.1 * wrong
 

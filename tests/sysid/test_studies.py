@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE
 
-from sysid.search import studies, tpe
+from sysid.search import studies
 from sysid.search.studies import BATCH, SharedStudy, StudyPlace, open_storage
 
 NAMES = ("a", "b")
@@ -176,7 +176,8 @@ def test_processes_share_a_study_in_postgresql_and_one_may_be_killed(postgresql)
 
 
 def test_cmaes_finds_the_planted_parameters(objective):
-    result = tpe.fit(objective, objective.space, tpe.GlobalSearch(15 * BATCH["cmaes"], 1, method="cmaes"))
+    search = studies.GlobalSearch(15 * BATCH["cmaes"], 1, method="cmaes")
+    result = studies.global_search(objective, objective.space, search)
     assert result.evaluations == 15 * BATCH["cmaes"]
     assert result.cost < 1.5 < result.initial_cost
     np.testing.assert_allclose(UNICYCLE_SPACE.to_values(result.u), TRUTH, rtol=0.15)

@@ -67,7 +67,7 @@ def bench():
         evidence=SimpleNamespace(groups=tuple((i,) for i in range(len(trials))), precision=400.0 * np.eye(2)))
     made = UnnamedReplays(result)
     slopes = made.drives.linearised(made.values, made.u, np.full(2, 0.02))[1]
-    base.jacobian = made.white(made.drives, slopes)
+    base.jacobian = made.white(slopes, made.drives.mask)
     return made
 
 
