@@ -79,7 +79,10 @@ def load_log(folder: str | Path) -> Log:
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
-    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never)."""
+    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never).
+
+    The trial starts with the first row of its streams.
+    """
     command = Command(**read_csv(folder / "command.csv", COMMAND_COLUMNS))
     measured: dict[str, Any] = {
         name: kind(**read_csv(path, columns)) for name, kind, columns in (
@@ -93,14 +96,18 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
     for name, stream in measured.items():
         _check_way(folder / f"{name}.csv", stream, measured.get("odometry", command))
         _check_reach(folder / f"{name}.csv", stream, command)  # before unwrapping, which would hide degrees
-    odometry, ground_truth = (None if (one := measured.get(name)) is None else replace(one, yaw=np.unwrap(one.yaw))
-                              for name in ("odometry", "ground_truth"))
+    begin = min(float(one.t[0]) for one in (command, *measured.values()))  # replays begin at 0, whatever t counts from
+    command = replace(command, t=command.t - begin)
+    odometry, ground_truth = (
+        None if (one := measured.get(name)) is None else replace(one, t=one.t - begin, yaw=np.unwrap(one.yaw))
+        for name in ("odometry", "ground_truth"))
     if timeout is not None:
         command = with_timeout(command, timeout)
     trial = make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
     if not imu.exists():
         return trial
     t, rates = read_csv(imu, GYRO_COLUMNS).values()
+    t = t - begin
     inside = (t >= 0) & (t <= trial.duration)
     return trial if inside.sum() < 2 else replace(trial, gyro=GyroStream.of_rates(t[inside], rates[inside]))
 
@@ -111,8 +118,8 @@ def make_trial(
 ) -> Trial:
     """A trial with its start: the mean pose over at most one second of standstill before the first command.
 
-    The odometry is counted from there. A first command that already moves starts in motion, at the first sample and
-    the speeds of the odometry, or else those commanded.
+    The odometry is counted from there. A first command that already moves starts in motion, at the speeds that the
+    odometry has until it comes, or else at those commanded.
     """
     moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
     still = float(min(command.t[moving[0]] if len(moving) else np.inf, command.t[0] + STANDSTILL))
@@ -263,9 +270,12 @@ def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Comma
 def _start_speeds(command: Command, odometry: OdometryStream | None) -> tuple[float, float]:
     """Speed [m/s] and yaw rate [rad/s] at the start; exactly 0 at rest, whatever the sensors' noise."""
     at_start = float(command.v[0]), float(command.omega[0])
-    if command.t[0] > 0 or max(abs(at_start[0]), abs(at_start[1])) < 1e-6:
+    if odometry is None and command.t[0] > 0 or max(abs(at_start[0]), abs(at_start[1])) < 1e-6:
         return 0.0, 0.0
-    speeds = at_start if odometry is None else (float(odometry.v[0]), float(odometry.omega[0]))
+    speeds = at_start
+    if odometry is not None:  # a single noisy row is no motion
+        until = max(int((odometry.t <= command.t[0]).sum()), 1)
+        speeds = float(np.median(odometry.v[:until])), float(np.median(odometry.omega[:until]))
     return speeds if max(abs(speeds[0]), abs(speeds[1])) > START_NOISE else (0.0, 0.0)
 
 

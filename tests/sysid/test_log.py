@@ -95,6 +95,32 @@ def test_the_start_pose_does_not_look_beyond_the_standstill(dataset):
     assert load_log(dataset).trials[0].start == before
 
 
+@pytest.mark.parametrize("begin", [-4.0, 0.25, 36_000.0])
+def test_a_trial_starts_with_its_first_row_whatever_its_time_counts_from(dataset, begin):
+    """Times before a trigger, or of the day: a replay begins at 0, and a late one would be cut into empty windows."""
+    plain = load_any(dataset).trials[0]
+    for path in (dataset / "trials" / "straight_1").glob("*.csv"):
+        header, *rows = path.read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        path.write_text("\n".join([header, *(",".join([f"{float(t) + begin:.6f}", *more]) for t, *more in cells)]) + "\n")
+    later = load_any(dataset).trials[0]
+    assert later.name == plain.name and later.start == plain.start
+    for name in ("command", "odometry", "ground_truth"):
+        np.testing.assert_allclose(getattr(later, name).t, getattr(plain, name).t, atol=1e-6)
+
+
+@pytest.mark.parametrize("before", [0.5, 0.0])
+def test_a_vehicle_that_already_moves_before_its_first_command_starts_in_motion(dataset, before):
+    folder = dataset / "trials" / "straight_1"
+    t = np.arange(0.0, 3.0, 0.1)
+    late = t[3:] - 0.05
+    write_csv(folder / "command.csv", "t,v,omega", np.column_stack([late, 0 * late + 0.5, 0 * late]))
+    v = np.where(t > late[0], 0.5, before)
+    v[0] += 0.05  # noise
+    write_csv(folder / "odometry.csv", "t,x,y,yaw,v,omega", np.column_stack([t, 0.5 * t, 0 * t, 0 * t, v, 0 * t]))
+    assert load_log(dataset).trials[0].start.v == pytest.approx(before)
+
+
 def test_replicates_share_the_name_before_the_number():
     assert manoeuvre_of("figure_eight_12") == "figure_eight"
     assert manoeuvre_of("circle") == "circle"
