@@ -197,7 +197,7 @@ def bag_drives(
     """Trials of one bag, and notes; `spec` has the geometry of wheels whose angles or rates were recorded."""
     topics = {name: topic for name, option in OPTIONS.items()
               if (topic := getattr(config, option[2:].replace("-", "_"))) is not None}
-    bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
+    bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels, config.stamp), config.stamp)
     imu = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name == "imu"})
     bag = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name != "imu"})
     said = clock_notes(bag, config.stamp)

@@ -182,6 +182,28 @@ def test_joint_states_without_rates_are_left_out_or_their_angles_are_taken(tmp_p
     assert any(said in note for note in notes) if said else not any("not finite" in note for note in notes)
 
 
+def test_angles_of_wheels_that_came_in_bursts_are_differenced_over_their_header_stamps(tmp_path):
+    kind, empty = "sensor_msgs/msg/JointState", np.zeros(0)
+
+    def wheels(rows):
+        made, angle = [row for row in rows if row[1] == COMMAND], np.zeros(2)
+        for k, t in enumerate(np.arange(0.0, 21.0, 0.05)):
+            v, omega, *_ = motion(t)
+            angle = angle + 0.05 * np.array([v - omega * 0.08, v + omega * 0.08]) / 0.033
+            received = 0.5 * np.ceil((t + 0.01) / 0.5) + 1e-4 * (k % 10)
+            made.append((received, "/joint_states", kind, message(
+                kind, header=header(T0 + t), name=["left_wheel", "right_wheel"], position=angle, velocity=empty,
+                effort=empty)))
+        return sorted(made, key=lambda row: row[0])
+
+    bag = write_bag(tmp_path / "drive", edit=wheels)
+    log, _ = convert(ConvertConfig(bag, tmp_path / "data", wheel_radius=0.033, track=0.16, stamp="header"))
+    odometry = log.trials[0].odometry
+    moving = (odometry.t > 2.5) & (odometry.t < 7.5)
+    np.testing.assert_allclose(odometry.v[moving], 0.5, atol=1e-3)
+    assert odometry.yaw[moving][-1] == pytest.approx(5.4, abs=0.2)
+
+
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_a_bag_becomes_a_trial_that_the_loader_accepts(tmp_path, storage):
     write_bag(tmp_path / "circle_1", storage)
