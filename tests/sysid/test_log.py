@@ -102,7 +102,8 @@ def test_a_trial_starts_with_its_first_row_whatever_its_time_counts_from(dataset
     for path in (dataset / "trials" / "straight_1").glob("*.csv"):
         header, *rows = path.read_text().splitlines()
         cells = [row.split(",") for row in rows]
-        path.write_text("\n".join([header, *(",".join([f"{float(t) + begin:.6f}", *more]) for t, *more in cells)]) + "\n")
+        moved = [",".join([f"{float(t) + begin:.6f}", *more]) for t, *more in cells]
+        path.write_text("\n".join([header, *moved]) + "\n")
     later = load_any(dataset).trials[0]
     assert later.name == plain.name and later.start == plain.start
     for name in ("command", "odometry", "ground_truth"):
