@@ -25,6 +25,7 @@ from sysid.logs.records import (
     held_from_middle,
     logged_pose,
     manoeuvre_of,
+    name_of,
     with_timeout,
 )
 from whill_mjx.io import fields as tables
@@ -75,7 +76,7 @@ def load_log(folder: str | Path) -> Log:
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
         notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
-    return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
+    return Log(name_of(folder), spec, trials, hash_files(folder), tuple(notes), fields)
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -217,6 +218,11 @@ def hash_files(folder: Path) -> str:
                 while part := file.read(1 << 20):
                     digest.update(part)
     return digest.hexdigest()
+
+
+def name_of(path: Path) -> str:
+    """Name of a file or folder, also of one that is given as `.` or `..`."""
+    return Path(os.path.abspath(path)).name
 
 
 def spaced(t: np.ndarray, least: float) -> np.ndarray:

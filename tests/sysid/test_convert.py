@@ -225,6 +225,17 @@ def test_a_bag_becomes_a_trial_that_the_loader_accepts(tmp_path, storage):
     assert log.spec.wheel_radius == 0.1325
 
 
+@pytest.mark.parametrize(("here", "given"), [("circle_1", "."), ("circle_1/below", "..")])
+def test_a_recording_is_called_after_its_folder_also_where_that_is_the_current_one(tmp_path, monkeypatch, here, given):
+    write_bag(tmp_path / "circle_1")
+    (tmp_path / here).mkdir(exist_ok=True)
+    monkeypatch.chdir(tmp_path / here)
+    log, _ = convert(ConvertConfig(Path(given), tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["circle_1"]
+    monkeypatch.chdir(tmp_path / "log")
+    assert load_any(".").name == "log"
+
+
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])
 def test_a_bag_file_without_its_folder_is_read_too(tmp_path, suffix):
     storage = StoragePlugin.MCAP if suffix == ".mcap" else StoragePlugin.SQLITE3
