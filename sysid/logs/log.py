@@ -6,6 +6,7 @@ reference point: the centre of the driven axle (the vehicle's centre for skid dr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,13 @@ from sysid.logs.records import (
     PoseStream,
     Start,
     Trial,
+    cell_of,
     hash_files,
     held_from_middle,
     logged_pose,
     manoeuvre_of,
     name_of,
+    seen_from,
     with_timeout,
 )
 from whill_mjx.io import fields as tables
@@ -71,12 +74,29 @@ def load_log(folder: str | Path) -> Log:
                          "Correct the names, or nothing is really held out.")
     timeout = fields.get("command_timeout")
     trials = tuple(load_trial(path, path.name in held_out, timeout) for path in trial_folders)
+    notes += [f"{path / 'imu.csv'}: hardly any of its rows lies within the trial, so the gyro is left out. All streams "
+              "of a trial count from one origin" for path, trial in zip(trial_folders, trials, strict=True)
+              if trial.gyro is None and (path / "imu.csv").exists()]
     trials, said = with_sign(trials)
+    notes += said
+    trials, said = _near_origin(trials)
     notes += said
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
         notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
     return Log(name_of(folder), spec, trials, hash_files(folder), tuple(notes), fields)
+
+
+def _near_origin(trials: Sequence[Trial]) -> tuple[tuple[Trial, ...], list[str]]:
+    """Trials in a room whose origin is near their starts, one for all as far as possible, and a note where it moved.
+
+    Replays are in single precision: on a national grid a vehicle would not move at all.
+    """
+    place = next((cell_of(one.start) for one in trials if one.ground_truth is not None), (0.0, 0.0))
+    near = tuple(seen_from(trial, place) for trial in trials)
+    near = tuple(seen_from(trial, cell_of(trial.start)) for trial in near)
+    return near, [f"the outside pose is far from the origin of its room: it is counted from x {place[0]:.0f} m, y "
+                  f"{place[1]:.0f} m"] if any(place) else []
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:

@@ -17,6 +17,8 @@ from whill_mjx.vehicle.specs import VehicleSpec
 
 GYRO_SPACING = 0.05
 """Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
+FAR = 64.0
+"""Distance from the origin of the room [m] beyond which single precision rounds the way of a physics step by 1 %."""
 CHECK = "Check the log: "  # begins a note on a fault of a log
 CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}  # what a person calls a channel of a trial
 
@@ -165,6 +167,22 @@ class Prediction:
     ground_truth: PoseStream | None
     odometry: OdometryStream | None
     gyro: GyroStream | None = None
+
+
+def cell_of(start: Start) -> tuple[float, float]:
+    """Whole multiples of `FAR` that are nearest to x and y of a start [m]; 0 where that is near the origin."""
+    if np.hypot(start.x, start.y) <= FAR:
+        return 0.0, 0.0
+    return FAR * round(start.x / FAR), FAR * round(start.y / FAR)
+
+
+def seen_from(trial: Trial, place: tuple[float, float]) -> Trial:
+    """The same trial in a room whose origin is at a place x, y [m] of the former one."""
+    pose, (x, y) = trial.ground_truth, place
+    if pose is None or not (x or y):
+        return trial
+    return replace(trial, ground_truth=replace(pose, x=pose.x - x, y=pose.y - y),
+                   start=replace(trial.start, x=trial.start.x - x, y=trial.start.y - y))
 
 
 def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from sysid.logs.log import load_log, load_trial
 from sysid.logs.measured import load_any
 from sysid.logs.planar import integrate_speeds
-from sysid.logs.records import manoeuvre_of
+from sysid.logs.records import FAR, manoeuvre_of
 from sysid.logs.streams import trial_quality
 from whill_mjx.logs.dataset import write_csv, write_text
 from whill_mjx.vehicle.model import box_inertia
@@ -120,6 +120,24 @@ def test_a_vehicle_that_already_moves_before_its_first_command_starts_in_motion(
     v[0] += 0.05  # noise
     write_csv(folder / "odometry.csv", "t,x,y,yaw,v,omega", np.column_stack([t, 0.5 * t, 0 * t, 0 * t, v, 0 * t]))
     assert load_log(dataset).trials[0].start.v == pytest.approx(before)
+
+
+def test_a_room_of_a_national_grid_is_counted_from_near_the_drives(dataset):
+    """Single precision has steps of 0.03 m at 400 km: a replay there would stand still."""
+    plain = load_any(dataset)
+    for path in dataset.glob("trials/*/ground_truth.csv"):
+        header, *rows = path.read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        moved = [f"{t},{float(x) + 400_003.0:.6f},{float(y) + 5_420_017.0:.6f},{yaw}" for t, x, y, yaw in cells]
+        path.write_text("\n".join([header, *moved]) + "\n")
+    far = load_any(dataset)
+    assert any("counted from x 4000" in note for note in far.notes) and not any("counted" in n for n in plain.notes)
+    for mine, theirs in zip(far.trials, plain.trials, strict=True):
+        assert max(abs(mine.start.x), abs(mine.start.y)) < FAR
+        np.testing.assert_allclose(mine.ground_truth.x - mine.start.x, theirs.ground_truth.x - theirs.start.x,
+                                   atol=1e-5)
+        np.testing.assert_allclose(mine.start.x - far.trials[0].start.x, theirs.start.x - plain.trials[0].start.x,
+                                   atol=1e-5)
 
 
 def test_replicates_share_the_name_before_the_number():

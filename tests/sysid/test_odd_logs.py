@@ -13,7 +13,7 @@ from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
 from sysid.logs.metrics import CHANNELS
 from sysid.logs.planar import integrate_speeds
-from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
+from sysid.logs.records import FAR, Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 from sysid.logs.streams import clock_shift, response_shift
 from sysid.logs.unusable import stood, without_standing
 from sysid.logs.windows import WINDOW, in_windows
@@ -69,6 +69,15 @@ def test_nominal_sizes_that_the_outside_pose_contradicts_are_named(way, turn, sa
     found = sanity(log_of(*trials))
     assert len(found) == bool(said) and all(re.search(said, one) for one in found)
     assert doubts(log_of(*trials)) == []  # a fit frees sizes itself
+
+
+def test_windows_of_a_drive_of_kilometres_begin_near_the_origin_of_their_room():
+    log = in_windows(log_of(drive(seconds=130.0, size=30.0)))
+    starts = np.array([[trial.start.x, trial.start.y] for trial in log.trials])
+    assert np.hypot(*starts.T).max() < 1.5 * FAR
+    for trial in log.trials:
+        pose = trial.ground_truth
+        assert abs(np.hypot(pose.x[0] - trial.start.x, pose.y[0] - trial.start.y)) < 5.0
 
 
 def test_a_fit_and_a_loop_say_first_that_a_log_contradicts_itself():
