@@ -155,6 +155,7 @@ def test_joint_states_beside_commands_are_the_odometry(tmp_path):
     (np.zeros(0), [100], "1 messages with numbers that are not finite"),
     (np.zeros(2), [100, 101, 102], "3 messages with numbers that are not finite"),
     (None, range(1, 420), ""),
+    (None, None, ""),
 ])
 def test_joint_states_without_rates_are_left_out_or_their_angles_are_taken(tmp_path, position, gone, said):
     kind, empty = "sensor_msgs/msg/JointState", np.zeros(0)
@@ -167,7 +168,8 @@ def test_joint_states_without_rates_are_left_out_or_their_angles_are_taken(tmp_p
             angle = angle + 0.05 * rates
             made.append((t, "/joint_states", kind, message(
                 kind, header=header(T0 + t), name=["left_wheel", "right_wheel"], effort=empty,
-                position=angle if position is None else position, velocity=rates + (np.nan if k in gone else 0.0))))
+                position=angle if position is None else position,
+                velocity=np.zeros(2) if gone is None else rates + (np.nan if k in gone else 0.0))))
             made.append((t + 0.01, "/joint_states", kind, message(
                 kind, header=header(T0 + t), name=["arm"], position=np.zeros(1), velocity=np.zeros(1), effort=empty)))
         return sorted(made, key=lambda row: row[0])
