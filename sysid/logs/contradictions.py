@@ -38,6 +38,7 @@ BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
 REACH, LAG_DT = 10.0, 0.1  # s of delays that are tried beside a clock that runs fast, and steps of delays
+LONGEST = 3600.0  # s of a drive over which a clock that runs fast is looked for: tables of it grow with the time
 LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
 LEFT = {"odometry": 0.5, "commands": UNLIKE}
 """Of what is not alike, what a clock that runs fast may leave, beside what is measured and beside commands."""
@@ -197,7 +198,8 @@ def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.n
     theirs = _commanded(trial) if beside == "commands" else speeds(trial, "odometry", smooth=True)
     if ours is None or theirs is None:
         return None
-    t = np.arange(min(ours[0][0], theirs[0][0]), max(ours[0][-1], theirs[0][-1]), LAG_DT)
+    begin, end = min(ours[0][0], theirs[0][0]), max(ours[0][-1], theirs[0][-1])
+    t = np.arange(begin, min(end, begin + LONGEST), LAG_DT)
     lags = np.arange(-REACH, REACH + LAG_DT / 2, LAG_DT)
     found = []
     for one, other in ((np.abs(ours[1]), np.abs(theirs[1])), (ours[2], theirs[2])):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sysid.logs.contradictions import running_fast
 from sysid.logs.coverage import doubts, sanity
 from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
@@ -69,6 +71,16 @@ def test_nominal_sizes_that_the_outside_pose_contradicts_are_named(way, turn, sa
     found = sanity(log_of(*trials))
     assert len(found) == bool(said) and all(re.search(said, one) for one in found)
     assert doubts(log_of(*trials)) == []  # a fit frees sizes itself
+
+
+def test_the_clocks_of_a_drive_of_hours_are_compared_in_little_memory():
+    trial = replace(drive(seconds=6 * 3600.0), gyro=None)
+    fast = replace(trial.ground_truth, t=1.05 * trial.ground_truth.t)
+    tracemalloc.start()
+    said = running_fast("ground_truth", [replace(trial, ground_truth=fast)], "odometry")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "5% faster" in said and peak < 6e8
 
 
 def test_windows_of_a_drive_of_kilometres_begin_near_the_origin_of_their_room():
