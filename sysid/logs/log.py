@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.gyro import with_sign
+from sysid.logs.planar import unwrapped
 from sysid.logs.records import (
     Command,
     GyroStream,
@@ -119,9 +120,14 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
         _check_reach(folder / f"{name}.csv", stream, command)  # before unwrapping, which would hide degrees
     begin = min(float(one.t[0]) for one in (command, *measured.values()))  # replays begin at 0, whatever t counts from
     command = replace(command, t=command.t - begin)
-    odometry, ground_truth = (
-        None if (one := measured.get(name)) is None else replace(one, t=one.t - begin, yaw=np.unwrap(one.yaw))
-        for name in ("odometry", "ground_truth"))
+    odometry, ground_truth = (None if (one := measured.get(name)) is None else replace(one, t=one.t - begin)
+                              for name in ("odometry", "ground_truth"))
+    if odometry is not None:
+        odometry = replace(odometry, yaw=unwrapped(odometry.yaw, np.diff(command.turned(odometry.t))))
+    if ground_truth is not None:
+        t, known = ground_truth.t, logged_pose(odometry)
+        turned = command.turned(t) if known is None else np.interp(t, known.t, known.yaw)
+        ground_truth = replace(ground_truth, yaw=unwrapped(ground_truth.yaw, np.diff(turned)))
     if timeout is not None:
         command = with_timeout(command, timeout)
     trial = make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)

@@ -36,6 +36,11 @@ class Command:
         """(T, 3) of t [s], v [m/s] and omega [rad/s]."""
         return np.column_stack([self.t, self.v, self.omega])
 
+    def turned(self, t: np.ndarray) -> np.ndarray:
+        """(T,) what the yaw rates add up to until times t (T,) [rad], from the first command."""
+        ends = np.append(self.t, max(float(t[-1]), float(self.t[-1])) + 1.0)
+        return np.asarray(np.interp(t, ends, np.append(0.0, np.cumsum(self.omega * np.diff(ends)))))
+
     def at(self, t: np.ndarray, before: tuple[float, float] | None = None) -> np.ndarray:
         """(2, T) v [m/s] and omega [rad/s] in force at times t (T,) [s]; `before` the first, by default the first's."""
         held = command_in_force(self, t)

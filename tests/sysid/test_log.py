@@ -75,6 +75,28 @@ def test_rows_that_were_held_between_updates_are_scored_once(dataset):
     assert any("not scored again" in note for note in log.notes) and not inspected.notes
 
 
+@pytest.mark.parametrize("slides", [1.0, 0.6])
+def test_a_heading_keeps_its_full_turns_over_a_gap(dataset, slides):
+    """Five seconds of a turn on the spot at 1.2 rad/s are lost, of both streams or of the outside pose."""
+    folder = dataset / "trials" / "straight_1"
+    t = np.arange(0.0, 20.0, 0.1)
+    omega, zero = np.where(t > 1.0, 1.2, 0.0), np.zeros_like(t)
+    yaw = np.append(0.0, np.cumsum(omega[:-1] * 0.1))
+    kept = (t < 6.0) | (t > 11.0)
+    write_csv(folder / "command.csv", "t,v,omega", np.column_stack([t, zero, omega]))
+    body = slides * yaw
+    wrapped = np.angle(np.exp(1j * body))
+    write_csv(folder / "ground_truth.csv", "t,x,y,yaw", np.column_stack([t, zero, zero, wrapped])[kept])
+    for rows in (slice(None), kept):
+        table = np.column_stack([t, zero, zero, np.angle(np.exp(1j * yaw)), zero, omega])
+        write_csv(folder / "odometry.csv", "t,x,y,yaw,v,omega", table[rows])
+        trial = load_log(dataset).trials[0]
+        assert trial.odometry.yaw[-1] == pytest.approx(yaw[-1], abs=1e-3)
+        assert trial.ground_truth.yaw[-1] == pytest.approx(body[-1], abs=1e-3)
+    (folder / "odometry.csv").unlink()
+    assert load_log(dataset).trials[0].ground_truth.yaw[-1] == pytest.approx(body[-1], abs=1e-3)
+
+
 def test_odometry_is_counted_from_the_start_of_the_drive(dataset):
     folder = dataset / "trials" / "straight_1"
     t = np.arange(0.0, 3.0, 0.1)
