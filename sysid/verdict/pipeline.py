@@ -29,7 +29,7 @@ from sysid.verdict.guards import guarded, stand
 from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
-from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
+from sysid.verdict.preparation import as_shown, days_of, expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Support
 from sysid.verdict.rounds import Asked, begin
 from sysid.verdict.search import pairs_of, settle
@@ -57,6 +57,7 @@ def find_missing(
     if reference is None:
         reference = reference_for(log, references, config, vehicle, progress)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
+    log, ready = as_shown(log, ready)
     fitted = time.perf_counter()
     seen = _look(log, ready.without(config.without), config, progress)
     gathered = time.perf_counter()
