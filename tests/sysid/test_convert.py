@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import socket
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from sysid.logs.planar import yaw_of
 from sysid.logs.published.drive_norlab import load_drive
 from sysid.logs.records import Command, OdometryStream, PoseStream
 from sysid.logs.sources import refuse_recording
+from whill_mjx.io.folders import FolderRefused
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -225,6 +227,18 @@ def test_a_bag_becomes_a_trial_that_the_loader_accepts(tmp_path, storage):
     start = trial.command.t[np.flatnonzero(trial.command.v)[0]]
     assert start == pytest.approx(2.0 - origin, abs=1e-3)
     assert log.spec.wheel_radius == 0.1325
+
+
+def test_the_same_command_goes_on_after_a_conversion_that_was_killed(bag, tmp_path):
+    out = tmp_path / "log"
+    (out / f".partial-{socket.gethostname()}-{2**22 + 1}" / "trials" / "figure_1").mkdir(parents=True)
+    (out / ".lock").write_text("{}")
+    convert_module.main(ConvertConfig(bag, out))
+    assert sorted(path.name for path in out.iterdir()) == [".lock", "dataset.toml", "trials"]
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "todo.txt").write_text("mine")
+    with pytest.raises(FolderRefused, match="holds other files, and no dataset.toml"):
+        convert_module.main(ConvertConfig(bag, tmp_path / "notes"))
 
 
 @pytest.mark.parametrize(("here", "given"), [("circle_1", "."), ("circle_1/below", "..")])
