@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
+from sysid.errors.features import check_length
 from sysid.errors.space import Space
 from sysid.logs.records import Log, Trial
 from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec
@@ -39,7 +40,7 @@ def causes(trials: Sequence[Trial], least: float = DRIVES) -> list[str]:
 
 
 def check_moves(log: Log) -> None:
-    """Refuse a log of which no training trial is commanded to move for a while: it determines nothing."""
+    """Refuse a log of which no training trial is commanded to move for a while, or lasts: it determines nothing."""
     seconds, least = 0.0, drives_from(log.spec)
     for trial in log.training:
         command = trial.command
@@ -51,6 +52,8 @@ def check_moves(log: Log) -> None:
         raise ValueError(f"log {log.name!r}: its training trials are commanded to move for {seconds:.1f} s in all, "
                          f"which determines nothing: commands below {least:.2g} m/s and {TURNS:g} rad/s do not count. "
                          "Record longer drives; sysid.inspect says which.")
+    if log.training:
+        check_length(log.name, log.training)
 
 
 def without_hidden(space: Space, log: Log, asked: Sequence[str] = ()) -> Space:

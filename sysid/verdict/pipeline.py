@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
+from sysid.errors.features import bin_width, check_length
 from sysid.errors.noise import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log, Trial
@@ -157,6 +158,10 @@ def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
         raise ValueError(f"log {log.name!r} has neither odometry nor an outside pose. Record one of them.")
+    width = bin_width([trial for one in references or (log,) for trial in one.training])
+    for one in (log, *references):
+        if one.training:
+            check_length(one.name, one.training, width)
     seen = {content_of(trial): "the drives in question" for trial in log.trials if trial.command.table[:, 1:].any()}
     for number, other in enumerate(references):
         mine = {content_of(trial): trial.name for trial in other.training if trial.command.table[:, 1:].any()}
