@@ -103,7 +103,7 @@ def _near_origin(trials: Sequence[Trial]) -> tuple[tuple[Trial, ...], list[str]]
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
     """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never).
 
-    The trial starts with the first row of its streams.
+    The trial starts with the first row of its streams, unless that is within a second of 0.
     """
     command = Command(**read_csv(folder / "command.csv", COMMAND_COLUMNS))
     measured: dict[str, Any] = {
@@ -118,7 +118,8 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
     for name, stream in measured.items():
         _check_way(folder / f"{name}.csv", stream, measured.get("odometry", command))
         _check_reach(folder / f"{name}.csv", stream, command)  # before unwrapping, which would hide degrees
-    begin = min(float(one.t[0]) for one in (command, *measured.values()))  # replays begin at 0, whatever t counts from
+    begin = min(float(one.t[0]) for one in (command, *measured.values()))
+    begin = 0.0 if 0 <= begin <= STANDSTILL else begin  # replays begin at 0, whatever t counts from
     command = replace(command, t=command.t - begin)
     odometry, ground_truth = (None if (one := measured.get(name)) is None else replace(one, t=one.t - begin)
                               for name in ("odometry", "ground_truth"))
