@@ -211,11 +211,14 @@ def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.n
     return np.mean(found, axis=0) if found else None
 
 
-def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times [s], speed and yaw rate that a vehicle has which follows its commands with a usual lag."""
+def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Times [s], speed and yaw rate that a vehicle has which follows its commands with a usual lag; None where nothing
+    is measured after the first of them."""
     from scipy.signal import lfilter
 
     t = np.arange(trial.command.t[0], max(trial.duration, trial.command.t[-1]), LAG_DT / 2)
+    if not len(t):
+        return None
     kept = np.exp(-LAG_DT / 2 / RESPONSE)
     v, omega = (lfilter([1 - kept], [1.0, -kept], one, zi=[kept * one[0]])[0] for one in trial.command.at(t))
     return t, v, omega

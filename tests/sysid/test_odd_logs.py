@@ -18,6 +18,7 @@ from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import FAR, Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 from sysid.logs.streams import clock_shift, response_shift
 from sysid.logs.unusable import stood, without_standing
+from sysid.logs.wheel_faults import backward_wheel
 from sysid.logs.windows import WINDOW, in_windows
 from whill_mjx.vehicle.specs import WHILL_CR
 
@@ -81,6 +82,22 @@ def test_the_clocks_of_a_drive_of_hours_are_compared_in_little_memory():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert "5% faster" in said and peak < 6e8
+
+
+def test_a_drive_of_which_nothing_was_measured_after_its_first_command_is_no_fault():
+    whole = drive(seconds=8.0)
+    late = replace(whole, command=Command(whole.odometry.t[-1:], np.ones(1), np.ones(1)))
+    assert running_fast("odometry", [late]) == ""
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_outside_pose_that_begins_after_the_odometry_has_ended_shows_no_backward_wheel():
+    whole = drive(seconds=12.0)
+    early, late = whole.odometry.t < 5.0, whole.ground_truth.t > 6.0
+    columns = {name: values[early] for name, values in vars(whole.odometry).items()}
+    pose = {name: values[late] for name, values in vars(whole.ground_truth).items()}
+    apart = replace(whole, odometry=OdometryStream(**columns), ground_truth=PoseStream(**pose))
+    assert backward_wheel(log_of(apart)) == ""
 
 
 def test_windows_of_a_drive_of_kilometres_begin_near_the_origin_of_their_room():
