@@ -24,7 +24,7 @@ from sysid import command_line
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.records import Log
 from whill_mjx.io.fields import counted, in_shell
-from whill_mjx.io.folders import LOCK_FILE, FolderRefused, check_place, lock_folder
+from whill_mjx.io.folders import LOCK_FILE, PARTIAL, FolderRefused, check_place, lock_folder
 
 
 def main(config: ConvertConfig) -> Log:
@@ -73,7 +73,9 @@ def dataset_folder(out: Path) -> Iterator[None]:
         raise FolderRefused(f"--out {out}: is a file, not a folder. Choose another place.")
     check_place("--out", out)
     made = not out.exists()
-    if not made and not (out / "dataset.toml").exists() and any(one.name != LOCK_FILE for one in out.iterdir()):
+    foreign = [] if made else [one for one in out.iterdir() if one.name != LOCK_FILE
+                               and not one.name.startswith(PARTIAL)]  # of a conversion that was killed
+    if foreign and not (out / "dataset.toml").exists():
         raise FolderRefused(f"--out {out}: holds other files, and no dataset.toml. Choose another --out.")
     out.mkdir(parents=True, exist_ok=True)
     try:

@@ -98,6 +98,15 @@ def bin_width(trials: Sequence[Trial]) -> float:
     return enough[0] if enough else widths[int(np.argmax(share))]
 
 
+def check_length(name: str, trials: Sequence[Trial], width: float | None = None) -> None:
+    """Raise ValueError for a log by name whose trials are all shorter than a bin of a width [s], by default their own.
+    """
+    width, longest = width or bin_width(trials), max(trial.duration for trial in trials)
+    if longest < width:
+        raise ValueError(f"log {name!r}: its training trials last {longest:.2g} s at most, and motion is looked at "
+                         f"over {width:g} s. Record longer drives.")
+
+
 def pose_times(trial: Trial) -> np.ndarray:
     """(M + 1,) times of the start pose, long ago where it is no measurement, and of the outside poses."""
     if trial.ground_truth is None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import jax.numpy as jnp
 import numpy as np
 
 from sysid.errors.pose_objective import DEFAULT_NOISE, Noise, Objective
@@ -14,9 +15,11 @@ from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, placement
 from sysid.replay.records import Measured, Plant, Simulated
 from sysid.replay.rollout import Replay, make_batch, vehicle_plant
+from whill_mjx.effects.pose_mount import PoseMount
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.types import parameters_of
 
 INFLATION = 13.7  # samples that count as one: an AR(1) residual of 0.9 at 20 Hz makes z-values 3.7 times too large
 QUANTILE = 1.645  # of a 90 % interval
@@ -148,7 +151,7 @@ def propose(
 
     `channels`: what will be measured; `names`: parameters of interest, by default all that a log can determine.
     """
-    spec, params = subject.spec, subject.params
+    spec, params = subject.spec, tracked_at_axle(subject.params)
     limits = limits or Limits(max(spec.v_min, -1.0), min(spec.v_max, 1.0), min(spec.omega_max, 1.0))
     space = make_space(params, spec, names)
     plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
@@ -173,6 +176,14 @@ def propose(
         chosen.append(plans[0])
         prior = prior + plans[0].information
     return Proposal(chosen, first, space, before)
+
+
+def tracked_at_axle(params: Any) -> Any:
+    """The vehicle as if its outside pose followed the drive-axle centre: that is what is put at the start, with the
+    vehicle's own heading, and must stay in the room."""
+    mounts = [effect for effect in getattr(params, "effects", ()) if effect.name == PoseMount.name]
+    names = [f"{PoseMount.name}.{field}" for one in mounts for field in parameters_of(one)]
+    return set_values(params, names, jnp.zeros(len(names))) if names else params
 
 
 def driven_paths(objective: Objective) -> list[np.ndarray]:

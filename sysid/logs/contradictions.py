@@ -38,6 +38,7 @@ BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
 REACH, LAG_DT = 10.0, 0.1  # s of delays that are tried beside a clock that runs fast, and steps of delays
+LONGEST = 3600.0  # s of a drive over which a clock that runs fast is looked for: tables of it grow with the time
 LATE = (0.6, 1.5)  # s that the fit does not reach, beside odometry and beside commands, which a vehicle follows late
 LEFT = {"odometry": 0.5, "commands": UNLIKE}
 """Of what is not alike, what a clock that runs fast may leave, beside what is measured and beside commands."""
@@ -197,7 +198,8 @@ def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.n
     theirs = _commanded(trial) if beside == "commands" else speeds(trial, "odometry", smooth=True)
     if ours is None or theirs is None:
         return None
-    t = np.arange(min(ours[0][0], theirs[0][0]), max(ours[0][-1], theirs[0][-1]), LAG_DT)
+    begin, end = min(ours[0][0], theirs[0][0]), max(ours[0][-1], theirs[0][-1])
+    t = np.arange(begin, min(end, begin + LONGEST), LAG_DT)
     lags = np.arange(-REACH, REACH + LAG_DT / 2, LAG_DT)
     found = []
     for one, other in ((np.abs(ours[1]), np.abs(theirs[1])), (ours[2], theirs[2])):
@@ -209,11 +211,14 @@ def _unlikeness(trial: Trial, name: str, beside: str, rates: np.ndarray) -> np.n
     return np.mean(found, axis=0) if found else None
 
 
-def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times [s], speed and yaw rate that a vehicle has which follows its commands with a usual lag."""
+def _commanded(trial: Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Times [s], speed and yaw rate that a vehicle has which follows its commands with a usual lag; None where nothing
+    is measured after the first of them."""
     from scipy.signal import lfilter
 
     t = np.arange(trial.command.t[0], max(trial.duration, trial.command.t[-1]), LAG_DT / 2)
+    if not len(t):
+        return None
     kept = np.exp(-LAG_DT / 2 / RESPONSE)
     v, omega = (lfilter([1 - kept], [1.0, -kept], one, zi=[kept * one[0]])[0] for one in trial.command.at(t))
     return t, v, omega

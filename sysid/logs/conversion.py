@@ -19,7 +19,7 @@ from sysid.logs.dataset_writing import HEADERS, Found, write_dataset
 from sysid.logs.drive_cuts import SHORTEST, ConvertConfig, Drive, Source, at_axle, cut_drives, trial_drive
 from sysid.logs.log import load_log, read_csv, read_fields, spec_from_fields
 from sysid.logs.measured import detect_format, is_known, load_whole
-from sysid.logs.records import Log, spaced
+from sysid.logs.records import Log, name_of, spaced
 from sysid.logs.sources import is_lerobot
 from sysid.logs.tables.drives import TextDrive, join_drives, read_drives
 from sysid.logs.tables.text_table import text_files
@@ -197,7 +197,7 @@ def bag_drives(
     """Trials of one bag, and notes; `spec` has the geometry of wheels whose angles or rates were recorded."""
     topics = {name: topic for name, option in OPTIONS.items()
               if (topic := getattr(config, option[2:].replace("-", "_"))) is not None}
-    bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels), config.stamp)
+    bag = in_order(read_bag(path, topics, (spec.wheel_radius, spec.track), wheels, config.stamp), config.stamp)
     imu = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name == "imu"})
     bag = replace(bag, streams={name: stream for name, stream in bag.streams.items() if name != "imu"})
     said = clock_notes(bag, config.stamp)
@@ -232,10 +232,10 @@ def bag_drives(
 def _recording_name(path: Path) -> str:
     """Name of a recording: of its folder, also where the recorder was killed and left only the file FOLDER_0 in it."""
     if not path.is_file():
-        return path.name
+        return name_of(path)
     stem = Path(path.stem).stem if path.suffix in PACKED else path.stem
-    alone = stem == f"{path.absolute().parent.name}_0" and len(find_bags(path.parent)) == 1
-    return path.absolute().parent.name if alone else stem
+    alone = stem == f"{name_of(path.parent)}_0" and len(find_bags(path.parent)) == 1
+    return name_of(path.parent) if alone else stem
 
 
 def _spec(config: ConvertConfig, there: VehicleSpec | None, noted: VehicleSpec | None = None) -> VehicleSpec:

@@ -6,6 +6,7 @@ reference point: the centre of the driven axle (the vehicle's centre for skid dr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.gyro import with_sign
+from sysid.logs.planar import unwrapped
 from sysid.logs.records import (
     Command,
     GyroStream,
@@ -21,10 +23,13 @@ from sysid.logs.records import (
     PoseStream,
     Start,
     Trial,
+    cell_of,
     hash_files,
     held_from_middle,
     logged_pose,
     manoeuvre_of,
+    name_of,
+    seen_from,
     with_timeout,
 )
 from whill_mjx.io import fields as tables
@@ -70,16 +75,36 @@ def load_log(folder: str | Path) -> Log:
                          "Correct the names, or nothing is really held out.")
     timeout = fields.get("command_timeout")
     trials = tuple(load_trial(path, path.name in held_out, timeout) for path in trial_folders)
+    notes += [f"{path / 'imu.csv'}: hardly any of its rows lies within the trial, so the gyro is left out. All streams "
+              "of a trial count from one origin" for path, trial in zip(trial_folders, trials, strict=True)
+              if trial.gyro is None and (path / "imu.csv").exists()]
     trials, said = with_sign(trials)
+    notes += said
+    trials, said = _near_origin(trials)
     notes += said
     if fields.get("input") == "wheels":
         trials = tuple(replace(trial, command=held_from_middle(trial.command)) for trial in trials)
         notes.append("the input is measured wheel speeds, not commands: delays, drive and limits do not show")
-    return Log(folder.name, spec, trials, hash_files(folder), tuple(notes), fields)
+    return Log(name_of(folder), spec, trials, hash_files(folder), tuple(notes), fields)
+
+
+def _near_origin(trials: Sequence[Trial]) -> tuple[tuple[Trial, ...], list[str]]:
+    """Trials in a room whose origin is near their starts, one for all as far as possible, and a note where it moved.
+
+    Replays are in single precision: on a national grid a vehicle would not move at all.
+    """
+    place = next((cell_of(one.start) for one in trials if one.ground_truth is not None), (0.0, 0.0))
+    near = tuple(seen_from(trial, place) for trial in trials)
+    near = tuple(seen_from(trial, cell_of(trial.start)) for trial in near)
+    return near, [f"the outside pose is far from the origin of its room: it is counted from x {place[0]:.0f} m, y "
+                  f"{place[1]:.0f} m"] if any(place) else []
 
 
 def load_trial(folder: Path, held_out: bool = False, timeout: float | None = None) -> Trial:
-    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never)."""
+    """Load and check one trial folder; after `timeout` [s] without a command the base stops (None: never).
+
+    The trial starts with the first row of its streams, unless that is within a second of 0.
+    """
     command = Command(**read_csv(folder / "command.csv", COMMAND_COLUMNS))
     measured: dict[str, Any] = {
         name: kind(**read_csv(path, columns)) for name, kind, columns in (
@@ -93,14 +118,24 @@ def load_trial(folder: Path, held_out: bool = False, timeout: float | None = Non
     for name, stream in measured.items():
         _check_way(folder / f"{name}.csv", stream, measured.get("odometry", command))
         _check_reach(folder / f"{name}.csv", stream, command)  # before unwrapping, which would hide degrees
-    odometry, ground_truth = (None if (one := measured.get(name)) is None else replace(one, yaw=np.unwrap(one.yaw))
+    begin = min(float(one.t[0]) for one in (command, *measured.values()))
+    begin = 0.0 if 0 <= begin <= STANDSTILL else begin  # replays begin at 0, whatever t counts from
+    command = replace(command, t=command.t - begin)
+    odometry, ground_truth = (None if (one := measured.get(name)) is None else replace(one, t=one.t - begin)
                               for name in ("odometry", "ground_truth"))
+    if odometry is not None:
+        odometry = replace(odometry, yaw=unwrapped(odometry.yaw, np.diff(command.turned(odometry.t))))
+    if ground_truth is not None:
+        t, known = ground_truth.t, logged_pose(odometry)
+        turned = command.turned(t) if known is None else np.interp(t, known.t, known.yaw)
+        ground_truth = replace(ground_truth, yaw=unwrapped(ground_truth.yaw, np.diff(turned)))
     if timeout is not None:
         command = with_timeout(command, timeout)
     trial = make_trial(folder.name, command, odometry, ground_truth, held_out=held_out)
     if not imu.exists():
         return trial
     t, rates = read_csv(imu, GYRO_COLUMNS).values()
+    t = t - begin
     inside = (t >= 0) & (t <= trial.duration)
     return trial if inside.sum() < 2 else replace(trial, gyro=GyroStream.of_rates(t[inside], rates[inside]))
 
@@ -111,8 +146,8 @@ def make_trial(
 ) -> Trial:
     """A trial with its start: the mean pose over at most one second of standstill before the first command.
 
-    The odometry is counted from there. A first command that already moves starts in motion, at the first sample and
-    the speeds of the odometry, or else those commanded.
+    The odometry is counted from there. A first command that already moves starts in motion, at the speeds that the
+    odometry has until it comes, or else at those commanded.
     """
     moving = np.flatnonzero((np.abs(command.v) > 1e-6) | (np.abs(command.omega) > 1e-6))
     still = float(min(command.t[moving[0]] if len(moving) else np.inf, command.t[0] + STANDSTILL))
@@ -263,9 +298,12 @@ def _check_reach(path: Path, stream: OdometryStream | PoseStream, command: Comma
 def _start_speeds(command: Command, odometry: OdometryStream | None) -> tuple[float, float]:
     """Speed [m/s] and yaw rate [rad/s] at the start; exactly 0 at rest, whatever the sensors' noise."""
     at_start = float(command.v[0]), float(command.omega[0])
-    if command.t[0] > 0 or max(abs(at_start[0]), abs(at_start[1])) < 1e-6:
+    if odometry is None and command.t[0] > 0 or max(abs(at_start[0]), abs(at_start[1])) < 1e-6:
         return 0.0, 0.0
-    speeds = at_start if odometry is None else (float(odometry.v[0]), float(odometry.omega[0]))
+    speeds = at_start
+    if odometry is not None:  # a single noisy row is no motion
+        until = max(int((odometry.t <= command.t[0]).sum()), 1)
+        speeds = float(np.median(odometry.v[:until])), float(np.median(odometry.omega[:until]))
     return speeds if max(abs(speeds[0]), abs(speeds[1])) > START_NOISE else (0.0, 0.0)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 DIFFERENCED = 0.2  # s over which a pose is differenced to speeds
 TURN = 2 * np.pi * 1.02  # rad of an angle that wraps at a turn, with some noise
+AS_SAID = 0.01  # rad^2 of turns beside which the turns that are expected count as they are
 RESET = 10.0  # times the 99th percentile of its steps by which an encoder changes where its counter begins anew
 
 
@@ -58,6 +59,19 @@ def without_wraps(angle: np.ndarray) -> np.ndarray:
     if over.any() and not over.all():
         steps[over] = np.interp(np.flatnonzero(over), np.flatnonzero(~over), steps[~over])
     return np.concatenate([angle[:1], angle[0] + np.cumsum(steps)])
+
+
+def unwrapped(yaw: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Heading (T,) without jumps of full turns [rad].
+
+    Between two rows it may turn further than half a turn, where others were lost. Turns (T - 1,) that are `expected`
+    then show by how many full turns, by as much as it follows them elsewhere: wheels that slide turn a vehicle less.
+    """
+    steps, sure = np.diff(yaw), np.abs(expected) < np.pi / 2
+    plain = steps - 2 * np.pi * np.round(steps / (2 * np.pi))
+    share = (AS_SAID + plain[sure] @ expected[sure]) / (AS_SAID + expected[sure] @ expected[sure])
+    turns = np.round((steps - share * expected) / (2 * np.pi))
+    return np.asarray(yaw - 2 * np.pi * np.append(0.0, np.cumsum(turns)))
 
 
 def added_up(when: np.ndarray, rate: np.ndarray, t: np.ndarray) -> np.ndarray:

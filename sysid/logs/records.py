@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,8 @@ from whill_mjx.vehicle.specs import VehicleSpec
 
 GYRO_SPACING = 0.05
 """Least time between samples of a gyro [s]: quicker ones are added up, which loses nothing of what they turn."""
+FAR = 64.0
+"""Distance from the origin of the room [m] beyond which single precision rounds the way of a physics step by 1 %."""
 CHECK = "Check the log: "  # begins a note on a fault of a log
 CHANNEL_NAMES = {"ground_truth": "outside pose", "odometry": "odometry"}  # what a person calls a channel of a trial
 
@@ -32,6 +35,11 @@ class Command:
     def table(self) -> np.ndarray:
         """(T, 3) of t [s], v [m/s] and omega [rad/s]."""
         return np.column_stack([self.t, self.v, self.omega])
+
+    def turned(self, t: np.ndarray) -> np.ndarray:
+        """(T,) what the yaw rates add up to until times t (T,) [rad], from the first command."""
+        ends = np.append(self.t, max(float(t[-1]), float(self.t[-1])) + 1.0)
+        return np.asarray(np.interp(t, ends, np.append(0.0, np.cumsum(self.omega * np.diff(ends)))))
 
     def at(self, t: np.ndarray, before: tuple[float, float] | None = None) -> np.ndarray:
         """(2, T) v [m/s] and omega [rad/s] in force at times t (T,) [s]; `before` the first, by default the first's."""
@@ -166,6 +174,22 @@ class Prediction:
     gyro: GyroStream | None = None
 
 
+def cell_of(start: Start) -> tuple[float, float]:
+    """Whole multiples of `FAR` that are nearest to x and y of a start [m]; 0 where that is near the origin."""
+    if np.hypot(start.x, start.y) <= FAR:
+        return 0.0, 0.0
+    return FAR * round(start.x / FAR), FAR * round(start.y / FAR)
+
+
+def seen_from(trial: Trial, place: tuple[float, float]) -> Trial:
+    """The same trial in a room whose origin is at a place x, y [m] of the former one."""
+    pose, (x, y) = trial.ground_truth, place
+    if pose is None or not (x or y):
+        return trial
+    return replace(trial, ground_truth=replace(pose, x=pose.x - x, y=pose.y - y),
+                   start=replace(trial.start, x=trial.start.x - x, y=trial.start.y - y))
+
+
 def command_in_force(command: Command, t: np.ndarray) -> np.ndarray:
     """Index of the command that holds at times t (T,); -1 before the first."""
     return np.searchsorted(command.t, t + 1e-9, side="right") - 1
@@ -217,6 +241,11 @@ def hash_files(folder: Path) -> str:
                 while part := file.read(1 << 20):
                     digest.update(part)
     return digest.hexdigest()
+
+
+def name_of(path: Path) -> str:
+    """Name of a file or folder, also of one that is given as `.` or `..`."""
+    return Path(os.path.abspath(path)).name
 
 
 def spaced(t: np.ndarray, least: float) -> np.ndarray:

@@ -53,6 +53,8 @@ def _speeds_beside(trial: Trial, beside: str, measured_input: bool) -> tuple[np.
     if beside == "commands" or pose is None:
         return np.array(odometry[1:]), np.array(trial.command.at(odometry[0] - RESPONSE, (0.0, 0.0)))
     inside = (pose[0] >= odometry[0][0]) & (pose[0] <= odometry[0][-1])
+    if not inside.any():
+        return None
     return (np.array([np.interp(pose[0][inside], odometry[0], one) for one in odometry[1:]]),
             np.array([one[inside] for one in pose[1:]]))
 

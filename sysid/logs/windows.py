@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.records import Command, Log, Start, Trial, logged_pose
+from sysid.logs.records import Command, Log, Start, Trial, cell_of, logged_pose, seen_from
 from sysid.logs.replicates import same_course
 
 WINDOW = 20.0
@@ -62,8 +62,9 @@ def _window(trial: Trial, number: int, length: float) -> Trial | None:
     if not any(one is not None and len(one.t) > 1 for one in streams[:2]):
         return None
     breaks = tuple((a - begin, b - begin) for a, b in trial.breaks if a < end and b > begin)
-    return replace(trial, name=f"{trial.name}/{number:03d}", command=_commands(trial.command, begin, end), start=start,
-                   ground_truth=streams[0], odometry=streams[1], gyro=streams[2], breaks=breaks)
+    window = replace(trial, name=f"{trial.name}/{number:03d}", command=_commands(trial.command, begin, end),
+                     start=start, ground_truth=streams[0], odometry=streams[1], gyro=streams[2], breaks=breaks)
+    return seen_from(window, cell_of(start))
 
 
 def _commands(command: Command, begin: float, end: float) -> Command:

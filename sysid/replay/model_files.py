@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 from sysid.replay.models import Model
 from whill_mjx.effects import EFFECTS
@@ -57,14 +60,7 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
                           calibrate=not inside)
     if path.suffix != ".py":
         raise ValueError(f"{path}: a model is {', '.join(ROBOT_FILES)} or .py. Rename the file or write an adapter.")
-    loader = importlib.util.spec_from_file_location(path.stem, path)
-    assert loader is not None and loader.loader is not None
-    module = importlib.util.module_from_spec(loader)
-    try:
-        loader.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"{path}: ends in {type(error).__name__} when it is run ({error}). Correct it; run it alone "
-                         "to see where.") from error
+    module = _run(path)
     if not hasattr(module, attribute):
         raise ValueError(f"{path}: defines no {attribute!r}. Give FILE.py:NAME, or name the model `model`.")
     found = getattr(module, attribute)
@@ -73,3 +69,19 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
         raise ValueError(f"{path}: {attribute} is a {type(found).__name__}; it must be a sysid.replay.models.Model. "
                          "Make it with function_model or mjcf_model.")
     return found
+
+
+def _run(path: Path) -> ModuleType:
+    """The module of a Python file; ValueError where it does not run."""
+    alias = f"model_{path.stem}_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:8]}"
+    loader = importlib.util.spec_from_file_location(alias, path)
+    assert loader is not None and loader.loader is not None
+    module = importlib.util.module_from_spec(loader)
+    sys.modules[alias] = module  # dataclasses look their module up
+    try:
+        loader.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        del sys.modules[alias]
+        raise ValueError(f"{path}: ends in {type(error).__name__} when it is run ({error}). Correct it; run it alone "
+                         "to see where.") from error
+    return module

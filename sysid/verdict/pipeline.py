@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sysid import command_line
+from sysid.errors.features import bin_width, check_length
 from sysid.errors.noise import NoiseLevels
 from sysid.logs.log import check_same_vehicle
 from sysid.logs.records import Log, Trial
@@ -29,7 +30,7 @@ from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.posterior import Thresholds, contradicted
-from sysid.verdict.preparation import days_of, expected_steps, prepare, reference_for
+from sysid.verdict.preparation import as_shown, days_of, expected_steps, prepare, reference_for
 from sysid.verdict.result import LoopConfig, Prepared, Result, Support
 from sysid.verdict.rounds import Asked, begin
 from sysid.verdict.search import pairs_of, settle
@@ -57,6 +58,7 @@ def find_missing(
     if reference is None:
         reference = reference_for(log, references, config, vehicle, progress)
     ready = reference if isinstance(reference, Prepared) else prepare(reference, log.spec, config, progress)
+    log, ready = as_shown(log, ready)
     fitted = time.perf_counter()
     seen = _look(log, ready.without(config.without), config, progress)
     gathered = time.perf_counter()
@@ -143,6 +145,10 @@ def check_logs(log: Log, references: Sequence[Log] = ()) -> None:
         raise ValueError(f"log {log.name!r} has no training trial. Take some out of held_out in its dataset.toml.")
     if all(trial.odometry is None for trial in log.training) and all(t.ground_truth is None for t in log.training):
         raise ValueError(f"log {log.name!r} has neither odometry nor an outside pose. Record one of them.")
+    width = bin_width([trial for one in references or (log,) for trial in one.training])
+    for one in (log, *references):
+        if one.training:
+            check_length(one.name, one.training, width)
     seen = {content_of(trial): "the drives in question" for trial in log.trials if trial.command.table[:, 1:].any()}
     for number, other in enumerate(references):
         mine = {content_of(trial): trial.name for trial in other.training if trial.command.table[:, 1:].any()}

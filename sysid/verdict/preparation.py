@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from sysid.errors.features import CHANNELS
 from sysid.errors.noise import repeated
 from sysid.errors.space import FIXED
-from sysid.logs.records import Log
+from sysid.logs.records import CHANNEL_NAMES, Log
 from sysid.missing.catalogue import PARAMETER, base_values, hypotheses, outside_hypotheses, with_catalogue
 from sysid.missing.days import Reference
 from sysid.missing.drives import make_drives, rows_of_call
@@ -50,6 +51,30 @@ def prepare(
     drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))
     wander = estimate(drives, reference, found, full, spec, progress)
     return Prepared(reference, plant, found, full, tuple(base), paths, wander)
+
+
+def as_shown(log: Log, ready: Prepared) -> tuple[Log, Prepared]:
+    """The log without what none of the reference drives measured, since nothing shows how far off that usually is, and
+    the vehicle with a remark on it. Held-out trials keep it: they are scored without any noise.
+
+    ValueError where training trials measured nothing else.
+    """
+    shown = np.any([(one.mask > 0).any(axis=0) for one in ready.reference.leftovers], axis=0)
+    streams = {name: [c for c, channel in enumerate(CHANNELS) if channel.startswith(prefix)]
+               for name, prefix in (("odometry", "odometry."), ("ground_truth", "pose."))}
+    unknown: dict[str, Any] = {name: None for name, columns in streams.items() if not shown[columns].any()
+                               and any(getattr(trial, name) is not None for trial in log.training)}
+    if not unknown:
+        return log, ready
+    kept = log.select(lambda trial: trial.held_out or any(getattr(trial, name) is not None for name in
+                                                          streams if name not in unknown))
+    what = " and ".join(CHANNEL_NAMES[name] for name in unknown)
+    if not kept.training:
+        raise ValueError(f"log {log.name!r}: its training trials have {what} alone, which no reference drive has: "
+                         "nothing shows its noise. Record the same on other days, or leave --reference out.")
+    trials = tuple(trial if trial.held_out else replace(trial, **unknown) for trial in kept.trials)
+    remark = f"{ready.reference.remark}; no reference drive has {what}, so that of these drives is left out"
+    return replace(kept, trials=trials), replace(ready, reference=replace(ready.reference, remark=remark))
 
 
 def _free(vehicle: Any, config: LoopConfig) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import socket
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from sysid.logs.planar import yaw_of
 from sysid.logs.published.drive_norlab import load_drive
 from sysid.logs.records import Command, OdometryStream, PoseStream
 from sysid.logs.sources import refuse_recording
+from whill_mjx.io.folders import FolderRefused
 
 pytestmark = pytest.mark.quick
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -155,6 +157,7 @@ def test_joint_states_beside_commands_are_the_odometry(tmp_path):
     (np.zeros(0), [100], "1 messages with numbers that are not finite"),
     (np.zeros(2), [100, 101, 102], "3 messages with numbers that are not finite"),
     (None, range(1, 420), ""),
+    (None, None, ""),
 ])
 def test_joint_states_without_rates_are_left_out_or_their_angles_are_taken(tmp_path, position, gone, said):
     kind, empty = "sensor_msgs/msg/JointState", np.zeros(0)
@@ -167,7 +170,8 @@ def test_joint_states_without_rates_are_left_out_or_their_angles_are_taken(tmp_p
             angle = angle + 0.05 * rates
             made.append((t, "/joint_states", kind, message(
                 kind, header=header(T0 + t), name=["left_wheel", "right_wheel"], effort=empty,
-                position=angle if position is None else position, velocity=rates + (np.nan if k in gone else 0.0))))
+                position=angle if position is None else position,
+                velocity=np.zeros(2) if gone is None else rates + (np.nan if k in gone else 0.0))))
             made.append((t + 0.01, "/joint_states", kind, message(
                 kind, header=header(T0 + t), name=["arm"], position=np.zeros(1), velocity=np.zeros(1), effort=empty)))
         return sorted(made, key=lambda row: row[0])
@@ -180,6 +184,28 @@ def test_joint_states_without_rates_are_left_out_or_their_angles_are_taken(tmp_p
     assert len(odometry.t) == pytest.approx(420 - len(gone) if said else 420, abs=2)
     assert any("420 messages without a wheel are left out" in note for note in notes)
     assert any(said in note for note in notes) if said else not any("not finite" in note for note in notes)
+
+
+def test_angles_of_wheels_that_came_in_bursts_are_differenced_over_their_header_stamps(tmp_path):
+    kind, empty = "sensor_msgs/msg/JointState", np.zeros(0)
+
+    def wheels(rows):
+        made, angle = [row for row in rows if row[1] == COMMAND], np.zeros(2)
+        for k, t in enumerate(np.arange(0.0, 21.0, 0.05)):
+            v, omega, *_ = motion(t)
+            angle = angle + 0.05 * np.array([v - omega * 0.08, v + omega * 0.08]) / 0.033
+            received = 0.5 * np.ceil((t + 0.01) / 0.5) + 1e-4 * (k % 10)
+            made.append((received, "/joint_states", kind, message(
+                kind, header=header(T0 + t), name=["left_wheel", "right_wheel"], position=angle, velocity=empty,
+                effort=empty)))
+        return sorted(made, key=lambda row: row[0])
+
+    bag = write_bag(tmp_path / "drive", edit=wheels)
+    log, _ = convert(ConvertConfig(bag, tmp_path / "data", wheel_radius=0.033, track=0.16, stamp="header"))
+    odometry = log.trials[0].odometry
+    moving = (odometry.t > 2.5) & (odometry.t < 7.5)
+    np.testing.assert_allclose(odometry.v[moving], 0.5, atol=1e-3)
+    assert odometry.yaw[moving][-1] == pytest.approx(5.4, abs=0.2)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
@@ -201,6 +227,29 @@ def test_a_bag_becomes_a_trial_that_the_loader_accepts(tmp_path, storage):
     start = trial.command.t[np.flatnonzero(trial.command.v)[0]]
     assert start == pytest.approx(2.0 - origin, abs=1e-3)
     assert log.spec.wheel_radius == 0.1325
+
+
+def test_the_same_command_goes_on_after_a_conversion_that_was_killed(bag, tmp_path):
+    out = tmp_path / "log"
+    (out / f".partial-{socket.gethostname()}-{2**22 + 1}" / "trials" / "figure_1").mkdir(parents=True)
+    (out / ".lock").write_text("{}")
+    convert_module.main(ConvertConfig(bag, out))
+    assert sorted(path.name for path in out.iterdir()) == [".lock", "dataset.toml", "trials"]
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "todo.txt").write_text("mine")
+    with pytest.raises(FolderRefused, match="holds other files, and no dataset.toml"):
+        convert_module.main(ConvertConfig(bag, tmp_path / "notes"))
+
+
+@pytest.mark.parametrize(("here", "given"), [("circle_1", "."), ("circle_1/below", "..")])
+def test_a_recording_is_called_after_its_folder_also_where_that_is_the_current_one(tmp_path, monkeypatch, here, given):
+    write_bag(tmp_path / "circle_1")
+    (tmp_path / here).mkdir(exist_ok=True)
+    monkeypatch.chdir(tmp_path / here)
+    log, _ = convert(ConvertConfig(Path(given), tmp_path / "log"))
+    assert [trial.name for trial in log.trials] == ["circle_1"]
+    monkeypatch.chdir(tmp_path / "log")
+    assert load_any(".").name == "log"
 
 
 @pytest.mark.parametrize("suffix", [".db3", ".mcap"])

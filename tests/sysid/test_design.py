@@ -23,8 +23,10 @@ from sysid.intervals.uncertainty import PRIOR_SD
 from sysid.logs.log import read_csv
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, make_command, placement
 from sysid.logs.metrics import ideal_replay
+from sysid.replay.models import with_effects
 from sysid.replay.records import Plant
-from whill_mjx.vehicle.parameters import get_values
+from whill_mjx.vehicle.parameters import get_values, set_values
+from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import WHILL_CR
 
 quick = pytest.mark.quick
@@ -208,6 +210,22 @@ def test_speeds_that_the_vehicle_does_not_drive_are_refused(option, tmp_path):
     wanted = -9.0 if option == "v_min" else 9.0
     with pytest.raises(ValueError, match=f"--{option.replace('_', '-')} {wanted:g}: whill_cr drives"):
         check_limits(DesignConfig("whill_cr", tmp_path / "a.csv", **{option: wanted}), WHILL_CR)
+
+
+def test_the_start_and_the_path_are_those_of_the_axle_wherever_the_tracked_point_is(monkeypatch):
+    """Of a tracked body that is turned by 90 degrees the path would be too, and leave the room at its side."""
+    class Planned(Exception):
+        pass
+
+    def plan(plant, apply, space, *_):
+        raise Planned(get_values(apply(space.initial), ("pose_mount.x", "pose_mount.yaw", "slip_traction.mu")))
+
+    monkeypatch.setattr("sysid.intervals.design.candidate_objective", plan)
+    params = with_effects(preset_params(WHILL_CR, "physical"), ("pose_mount",))
+    params = set_values(params, ("pose_mount.x", "pose_mount.yaw", "slip_traction.mu"), jnp.array([0.3, 1.5, 0.77]))
+    with pytest.raises(Planned) as planned:
+        propose(Subject(WHILL_CR, params), Limits(seconds=5.0))
+    np.testing.assert_allclose(planned.value.args[0], [0.0, 0.0, 0.77], atol=1e-6)
 
 
 def test_a_room_that_every_drive_leaves_is_refused(monkeypatch):

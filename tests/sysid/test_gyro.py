@@ -181,6 +181,17 @@ def test_imu_csv_of_a_dataset_is_read(folder, tmp_path):
 
 
 @pytest.mark.quick
+def test_a_gyro_of_another_clock_is_left_out_with_a_note(folder, tmp_path):
+    copied = shutil.copytree(folder, tmp_path / "log")
+    name = load_log(copied).trials[0].name
+    rows = "".join(f"{9000 + 0.01 * k:.2f},0.1\n" for k in range(500))
+    (copied / "trials" / name / "imu.csv").write_text(f"t,gyro\n{rows}")
+    log = load_log(copied)
+    assert log.trials[0].gyro is None
+    assert any("imu.csv: hardly any of its rows lies within the trial" in note for note in log.notes)
+
+
+@pytest.mark.quick
 def test_a_gyro_may_be_a_channel_that_was_not_measured_or_be_left_out(with_gyro, plain):
     features = make_features(plain.training, gyro=True)
     assert features.of(make_batch(plain.training, DT)[1])[..., 5].max() == 0.0  # a channel that was not measured

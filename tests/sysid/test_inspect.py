@@ -29,9 +29,10 @@ from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of, with_timeout
 from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
 from sysid.search import thin
+from sysid.verdict.pipeline import check_logs
 from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv
 from whill_mjx.vehicle.presets import preset_params
-from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.vehicle.specs import WHILL_CR, in_proportion
 
 pytestmark = pytest.mark.quick
 DT = 0.02
@@ -490,6 +491,24 @@ def test_a_log_in_which_nothing_moves_is_refused():
     with pytest.raises(ValueError, match="commanded to move for 0.0 s in all, which determines nothing"):
         thin.check_moves(log_of(still))
     thin.check_moves(log_of(trial_of(smooth_command())))
+
+
+def test_drives_that_are_shorter_than_what_motion_is_looked_at_over_are_refused():
+    t = np.arange(0.0, 0.2, 0.02)
+    short = [trial_of(Command(t, np.full(10, 0.5), 0 * t), name=f"a_{k}") for k in range(30)]
+    for check in (thin.check_moves, check_logs):
+        with pytest.raises(ValueError, match="'toy': its training trials last 0.15 s at most, .* over 0.25 s"):
+            check(log_of(*short))
+
+
+def test_a_small_robot_drives_at_speeds_at_which_a_chair_stands():
+    t = np.arange(0.0, 9.0, 0.1)
+    log = log_of(trial_of(Command(t, np.full(90, 0.03), np.zeros(90))))
+    with pytest.raises(ValueError, match="below 0.05 m/s and 0.1 rad/s do not count"):
+        thin.check_moves(log)
+    small = replace(log, spec=in_proportion(WHILL_CR, "small", wheel_radius=0.033, track=0.16))
+    thin.check_moves(small)
+    assert thin.causes(small.training, thin.drives_from(small.spec)) == ["no turn"]
 
 
 def test_a_first_glance_passes_all_drives_with_the_same_commands():

@@ -10,7 +10,7 @@ import pytest
 from sysid.logs.log import load_log, load_trial
 from sysid.logs.measured import load_any
 from sysid.logs.planar import integrate_speeds
-from sysid.logs.records import manoeuvre_of
+from sysid.logs.records import FAR, manoeuvre_of
 from sysid.logs.streams import trial_quality
 from whill_mjx.logs.dataset import write_csv, write_text
 from whill_mjx.vehicle.model import box_inertia
@@ -75,6 +75,28 @@ def test_rows_that_were_held_between_updates_are_scored_once(dataset):
     assert any("not scored again" in note for note in log.notes) and not inspected.notes
 
 
+@pytest.mark.parametrize("slides", [1.0, 0.6])
+def test_a_heading_keeps_its_full_turns_over_a_gap(dataset, slides):
+    """Five seconds of a turn on the spot at 1.2 rad/s are lost, of both streams or of the outside pose."""
+    folder = dataset / "trials" / "straight_1"
+    t = np.arange(0.0, 20.0, 0.1)
+    omega, zero = np.where(t > 1.0, 1.2, 0.0), np.zeros_like(t)
+    yaw = np.append(0.0, np.cumsum(omega[:-1] * 0.1))
+    kept = (t < 6.0) | (t > 11.0)
+    write_csv(folder / "command.csv", "t,v,omega", np.column_stack([t, zero, omega]))
+    body = slides * yaw
+    wrapped = np.angle(np.exp(1j * body))
+    write_csv(folder / "ground_truth.csv", "t,x,y,yaw", np.column_stack([t, zero, zero, wrapped])[kept])
+    for rows in (slice(None), kept):
+        table = np.column_stack([t, zero, zero, np.angle(np.exp(1j * yaw)), zero, omega])
+        write_csv(folder / "odometry.csv", "t,x,y,yaw,v,omega", table[rows])
+        trial = load_log(dataset).trials[0]
+        assert trial.odometry.yaw[-1] == pytest.approx(yaw[-1], abs=1e-3)
+        assert trial.ground_truth.yaw[-1] == pytest.approx(body[-1], abs=1e-3)
+    (folder / "odometry.csv").unlink()
+    assert load_log(dataset).trials[0].ground_truth.yaw[-1] == pytest.approx(body[-1], abs=1e-3)
+
+
 def test_odometry_is_counted_from_the_start_of_the_drive(dataset):
     folder = dataset / "trials" / "straight_1"
     t = np.arange(0.0, 3.0, 0.1)
@@ -93,6 +115,51 @@ def test_the_start_pose_does_not_look_beyond_the_standstill(dataset):
     lines[20:] = [",".join([line.split(",")[0], "2.5", *line.split(",")[2:]]) for line in lines[20:]]
     path.write_text("\n".join(lines) + "\n")
     assert load_log(dataset).trials[0].start == before
+
+
+@pytest.mark.parametrize("begin", [-4.0, 2.5, 36_000.0])
+def test_a_trial_starts_with_its_first_row_whatever_its_time_counts_from(dataset, begin):
+    """Times before a trigger, or of the day: a replay begins at 0, and a late one would be cut into empty windows."""
+    plain = load_any(dataset).trials[0]
+    for path in (dataset / "trials" / "straight_1").glob("*.csv"):
+        header, *rows = path.read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        moved = [",".join([f"{float(t) + begin:.6f}", *more]) for t, *more in cells]
+        path.write_text("\n".join([header, *moved]) + "\n")
+    later = load_any(dataset).trials[0]
+    assert later.name == plain.name and later.start == plain.start
+    for name in ("command", "odometry", "ground_truth"):
+        np.testing.assert_allclose(getattr(later, name).t, getattr(plain, name).t, atol=1e-6)
+
+
+@pytest.mark.parametrize("before", [0.5, 0.0])
+def test_a_vehicle_that_already_moves_before_its_first_command_starts_in_motion(dataset, before):
+    folder = dataset / "trials" / "straight_1"
+    t = np.arange(0.0, 3.0, 0.1)
+    late = t[3:] - 0.05
+    write_csv(folder / "command.csv", "t,v,omega", np.column_stack([late, 0 * late + 0.5, 0 * late]))
+    v = np.where(t > late[0], 0.5, before)
+    v[0] += 0.05  # noise
+    write_csv(folder / "odometry.csv", "t,x,y,yaw,v,omega", np.column_stack([t, 0.5 * t, 0 * t, 0 * t, v, 0 * t]))
+    assert load_log(dataset).trials[0].start.v == pytest.approx(before)
+
+
+def test_a_room_of_a_national_grid_is_counted_from_near_the_drives(dataset):
+    """Single precision has steps of 0.03 m at 400 km: a replay there would stand still."""
+    plain = load_any(dataset)
+    for path in dataset.glob("trials/*/ground_truth.csv"):
+        header, *rows = path.read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        moved = [f"{t},{float(x) + 400_003.0:.6f},{float(y) + 5_420_017.0:.6f},{yaw}" for t, x, y, yaw in cells]
+        path.write_text("\n".join([header, *moved]) + "\n")
+    far = load_any(dataset)
+    assert any("counted from x 4000" in note for note in far.notes) and not any("counted" in n for n in plain.notes)
+    for mine, theirs in zip(far.trials, plain.trials, strict=True):
+        assert max(abs(mine.start.x), abs(mine.start.y)) < FAR
+        np.testing.assert_allclose(mine.ground_truth.x - mine.start.x, theirs.ground_truth.x - theirs.start.x,
+                                   atol=1e-5)
+        np.testing.assert_allclose(mine.start.x - far.trials[0].start.x, theirs.start.x - plain.trials[0].start.x,
+                                   atol=1e-5)
 
 
 def test_replicates_share_the_name_before_the_number():

@@ -2,13 +2,16 @@
 """Parts of the closed loop on hand-made residuals: agreement, hypotheses, wander, whitening."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import sysid
 from sysid.errors.noise import fit_roughness, fit_whitener
+from sysid.logs.log import load_log
 from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.missing.days import Wander
 from sysid.missing.drives import DRAIN, SESSION, Drives
@@ -25,6 +28,7 @@ from sysid.verdict import search as search_module
 from sysid.verdict.agreement import foretold
 from sysid.verdict.found import Scan
 from sysid.verdict.posterior import Findings, Left, Thresholds, TriedSet, posterior, read, write
+from sysid.verdict.preparation import as_shown
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import imitation
 from whill_mjx.effects import about_of
@@ -341,3 +345,35 @@ def test_a_channel_that_was_not_measured_is_no_rougher():
     factors = fit_roughness(series * np.where(level == 3, 4.0, 1.0)[..., None] * mask, mask, level)
     assert np.allclose(factors[:, 1], 1.0)
     assert 3 < factors[3, 0] < 5 and factors[0, 0] == 1
+
+
+@dataclass(frozen=True)
+class Known:
+    """Of a `Reference`, what `as_shown` looks at; and of a `Prepared`."""
+
+    leftovers: tuple = ()
+    remark: str = "one day"
+    reference: object = None
+
+
+@pytest.mark.parametrize(("columns", "channel", "said"), [
+    ((0, 1), "ground_truth", "no reference drive has outside pose"),
+    ((2, 3, 4), "odometry", "no reference drive has odometry"), (range(5), "", ""),
+])
+def test_what_no_reference_drive_measured_is_left_out_of_the_drives_in_question(columns, channel, said):
+    """A channel without noise of its own would be taken for exact, and its least error for a missing effect."""
+    mask = np.zeros((9, 5))
+    mask[3:, list(columns)] = 1.0
+    ready = Known(reference=Known((SimpleNamespace(mask=np.zeros((7, 5))), SimpleNamespace(mask=mask))))
+    log = load_log(Path(sysid.__file__).parent / "data" / "chair")
+    kept, later = as_shown(log, ready)
+    assert all((getattr(trial, channel) is None) == (not trial.held_out) for trial in kept.trials) if channel else (
+        kept is log)
+    assert len(kept.trials) == len(log.trials) and said in later.reference.remark
+    if channel:
+        other = {"odometry": "ground_truth", "ground_truth": "odometry"}[channel]
+        first, *rest = log.trials
+        alone = replace(log, trials=(replace(first, **{other: None}), *rest))
+        assert len(as_shown(alone, ready)[0].trials) == len(log.trials) - 1
+        with pytest.raises(ValueError, match="alone, which no reference drive has"):
+            as_shown(replace(log, trials=alone.trials[:1]), ready)

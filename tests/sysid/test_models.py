@@ -538,6 +538,24 @@ def test_a_model_that_is_not_there_ends_with_an_error(function_file, text, error
 
 
 @pytest.mark.quick
+def test_a_model_file_may_hold_dataclasses(tmp_path):
+    """With annotations that are text, dataclasses look up the module that they are in."""
+    file = tmp_path / "own.py"
+    file.write_text("""
+from __future__ import annotations
+from dataclasses import dataclass
+import jax.numpy as jnp
+from sysid.replay.models import function_model
+
+@dataclass(frozen=True)
+class Settings:
+    gain: float = 1.0
+
+model = function_model(lambda p, state, command: p["gain"] * state, {"gain": (Settings().gain, 0.5, 2.0)}, dt=0.01)
+""")
+    assert load_model(str(file), WHILL_CR).params.values["gain"] == 1.0
+
+
 def test_effects_that_act_inside_a_vehicle_are_refused_around_a_model(function_file):
     model = load_model(str(function_file), WHILL_CR)
     with pytest.raises(ValueError, match="'yaw_scrub' acts inside a vehicle"):

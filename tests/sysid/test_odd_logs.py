@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sysid.logs.contradictions import running_fast
 from sysid.logs.coverage import doubts, sanity
 from sysid.logs.log import load_log
 from sysid.logs.measured import load_any
 from sysid.logs.metrics import CHANNELS
 from sysid.logs.planar import integrate_speeds
-from sysid.logs.records import Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
+from sysid.logs.records import FAR, Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
 from sysid.logs.streams import clock_shift, response_shift
 from sysid.logs.unusable import stood, without_standing
+from sysid.logs.wheel_faults import backward_wheel
 from sysid.logs.windows import WINDOW, in_windows
 from whill_mjx.vehicle.specs import WHILL_CR
 
@@ -69,6 +72,41 @@ def test_nominal_sizes_that_the_outside_pose_contradicts_are_named(way, turn, sa
     found = sanity(log_of(*trials))
     assert len(found) == bool(said) and all(re.search(said, one) for one in found)
     assert doubts(log_of(*trials)) == []  # a fit frees sizes itself
+
+
+def test_the_clocks_of_a_drive_of_hours_are_compared_in_little_memory():
+    trial = replace(drive(seconds=6 * 3600.0), gyro=None)
+    fast = replace(trial.ground_truth, t=1.05 * trial.ground_truth.t)
+    tracemalloc.start()
+    said = running_fast("ground_truth", [replace(trial, ground_truth=fast)], "odometry")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "5% faster" in said and peak < 6e8
+
+
+def test_a_drive_of_which_nothing_was_measured_after_its_first_command_is_no_fault():
+    whole = drive(seconds=8.0)
+    late = replace(whole, command=Command(whole.odometry.t[-1:], np.ones(1), np.ones(1)))
+    assert running_fast("odometry", [late]) == ""
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_outside_pose_that_begins_after_the_odometry_has_ended_shows_no_backward_wheel():
+    whole = drive(seconds=12.0)
+    early, late = whole.odometry.t < 5.0, whole.ground_truth.t > 6.0
+    columns = {name: values[early] for name, values in vars(whole.odometry).items()}
+    pose = {name: values[late] for name, values in vars(whole.ground_truth).items()}
+    apart = replace(whole, odometry=OdometryStream(**columns), ground_truth=PoseStream(**pose))
+    assert backward_wheel(log_of(apart)) == ""
+
+
+def test_windows_of_a_drive_of_kilometres_begin_near_the_origin_of_their_room():
+    log = in_windows(log_of(drive(seconds=130.0, size=30.0)))
+    starts = np.array([[trial.start.x, trial.start.y] for trial in log.trials])
+    assert np.hypot(*starts.T).max() < 1.5 * FAR
+    for trial in log.trials:
+        pose = trial.ground_truth
+        assert abs(np.hypot(pose.x[0] - trial.start.x, pose.y[0] - trial.start.y)) < 5.0
 
 
 def test_a_fit_and_a_loop_say_first_that_a_log_contradicts_itself():

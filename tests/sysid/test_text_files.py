@@ -396,6 +396,38 @@ def test_files_of_one_drive_are_joined_by_time_and_the_decision_is_written_and_c
     np.testing.assert_array_equal(again.trials[0].odometry.values, log.trials[0].odometry.values)
 
 
+def test_columns_of_one_stream_in_several_files_are_brought_to_one_clock(tmp_path):
+    """A file for each signal, as plotting programs and databases export them, each at times of its own."""
+    c, late = columns(), 0.013
+    write(tmp_path / "in" / "v.csv", {"time": c["t"], "cmd_v": c["cv"]})
+    write(tmp_path / "in" / "w.csv", {"time": c["t"] + late, "cmd_omega": c["cw"]})
+    write(tmp_path / "in" / "pose.csv", {"time": c["t"], "odom_x": c["x"], "odom_y": c["y"], "odom_yaw": c["yaw"]})
+    shifted = {name: np.interp(c["t"] + late, c["t"], c[key]) for name, key in (("odom_v", "v"), ("odom_omega", "w"))}
+    write(tmp_path / "in" / "twist.csv", {"time": c["t"] + late, **shifted})
+    _, notes = convert(ConvertConfig(tmp_path / "in", tmp_path / "data"))
+    trial = load_log(tmp_path / "data").trials[0]
+    begin = c["t"][1]  # the first row of the pose that the twist covers
+    assert np.abs(trial.odometry.v - np.interp(trial.odometry.t + begin, c["t"], c["v"])).mean() < 5e-3
+    for name, value in (("v", "cv"), ("omega", "cw")):
+        held = np.searchsorted(trial.command.t, [4.0, 10.0, 16.0], side="right") - 1
+        expected = c[value][np.searchsorted(c["t"], np.array([4.0, 10.0, 16.0]) + begin - late * (name == "omega"),
+                                            side="right") - 1]
+        np.testing.assert_allclose(getattr(trial.command, name)[held], expected, atol=1e-3)
+    assert any("omega of w hold until the next row of their file" in note for note in notes)
+    assert any("omega, v of twist are interpolated to the times of pose" in note for note in notes)
+
+
+def test_columns_of_one_stream_in_files_without_a_common_time_are_refused(tmp_path):
+    c = columns()
+    write(tmp_path / "in" / "v.csv", {"time": c["t"], "cmd_v": c["cv"]})
+    write(tmp_path / "in" / "odom.csv", {"time": c["t"], **{f"odom_{name}": c[name] for name in ("x", "y", "yaw")}})
+    write(tmp_path / "in" / "gt.csv", {"time": c["t"], "gt_x": c["gx"], "gt_y": c["gy"]})
+    write(tmp_path / "in" / "heading.csv", {"time": c["t"] + 500.0, "gt_yaw [rad]": c["gyaw"]})
+    write(tmp_path / "in" / "w.csv", {"time": c["t"], "cmd_omega": c["cw"]})
+    with pytest.raises(ValueError, match="columns of ground_truth are in files that share no time .*gt .*heading "):
+        convert(ConvertConfig(tmp_path / "in", tmp_path / "data"))
+
+
 def test_each_file_with_commands_and_odometry_is_a_drive(tmp_path):
     for name in ("circle_1", "circle_2"):
         c = columns(CHAIR[name])

@@ -392,8 +392,8 @@ DATASET = (
 COLUMNS = {field.name: field for field in (
     Field("t", "s", -DAY, DAY, remedy="It counts in seconds from the trial's start: subtract the first time stamp, and "
                                       "divide milli-, micro- or nanoseconds."),
-    Field("x", "m", -1e6, 1e6, remedy="Convert it to metres."),
-    Field("y", "m", -1e6, 1e6, remedy="Convert it to metres."),
+    Field("x", "m", -1e7, 1e7, remedy="Convert it to metres."),  # of a national grid, too
+    Field("y", "m", -1e7, 1e7, remedy="Convert it to metres."),
     Field("yaw", "rad", -1e5, 1e5, remedy="Convert it to radians."),
     Field("v", "m/s", -SPEED, SPEED, remedy="Convert it to m/s: is it in km/h or mm/s?"),
     Field("omega", "rad/s", -SPEED, SPEED, remedy="Convert it to rad/s: is it in deg/s?"),

@@ -26,6 +26,7 @@ from whill_mjx.io.reading import read_json
 RUN_FILE = "run.json"
 """Kind and identity of what a folder holds, written once."""
 LOCK_FILE = ".lock"
+PARTIAL = ".partial-"  # begins the name of a folder that a command has not finished
 NOTE = ".{}.written"
 """Name of the note of a single file: a line for each content that a command gave it. While it has one of them, it may
 be replaced. Lines are only appended, so that processes that write at once keep each other's."""
@@ -281,7 +282,7 @@ def new_folder(out: Path) -> Iterator[Path]:
 
 def unfinished(folder: Path, name: str = "") -> Path:
     """A place in `folder` for what this process has not finished; those of processes that were killed are removed."""
-    stem = f".{name}.partial-{socket.gethostname()}-" if name else f".partial-{socket.gethostname()}-"
+    stem = f".{name}.partial-{socket.gethostname()}-" if name else f"{PARTIAL}{socket.gethostname()}-"
     for leftover in folder.glob(f"{stem}*"):
         if not _runs(leftover.name.removeprefix(stem)):
             shutil.rmtree(leftover, ignore_errors=True)

@@ -40,7 +40,7 @@ DAY, STRAY = 86400.0, 0.01  # s from most messages, and the share of them, up to
 
 def read_bag(
     path: Path, topics: dict[str, str] | None = None, geometry: tuple[float, float] = (0.1325, 0.496),
-    wheels: bool = False,
+    wheels: bool = False, stamp: str = "receive",
 ) -> Bag:
     """Streams of a recording: the folder of a rosbag2, or a .db3, .mcap or .bag file.
 
@@ -48,12 +48,13 @@ def read_bag(
         topics: "command", "odometry", "ground_truth", "imu" -> topic; those left out are looked for, "" leaves one out.
         geometry: nominal wheel radius and track [m], for angles and rates of wheels.
         wheels: take measured wheel speeds in place of the commands.
+        stamp: "receive" or "header", the times over which angles of wheels are differenced and their rates add up.
     """
     if path.suffix in PACKED:
         with TemporaryDirectory() as folder:
             unpacked = _unpacked(path, Path(folder))
             try:
-                return replace(read_bag(unpacked, topics, geometry, wheels), path=path)
+                return replace(read_bag(unpacked, topics, geometry, wheels, stamp), path=path)
             except ValueError as error:
                 raise ValueError(str(error).replace(str(unpacked), str(path))) from None
     from rosbags.highlevel import AnyReader
@@ -87,7 +88,7 @@ def read_bag(
         if len(kept) >= 2:
             found = BagStream(topic, known[topic], kept[:, 0], kept[:, 1], kept[:, 2:])
             streams[stream] = found if kept.shape[1] - 2 == len(COLUMNS[stream]) else _of_wheels(
-                stream, found, geometry, notes)
+                stream, found, geometry, notes, stamp)
         elif stream not in spare:
             raise ValueError(f"{path}: topic {topic} has {len(kept)} usable messages; at least 2 are needed. Name "
                              f"another topic with {OPTIONS[stream]}, or '' to go without.")
@@ -216,21 +217,28 @@ def _usable(
     return table[finite & ~far & ~blank]
 
 
-def _of_wheels(stream: str, found: BagStream, geometry: tuple[float, float], notes: list[str]) -> BagStream:
+def _of_wheels(
+    stream: str, found: BagStream, geometry: tuple[float, float], notes: list[str], stamp: str
+) -> BagStream:
     """A stream of wheel angles and rates (T, 4) as motion, in order of time."""
-    later = np.append(True, np.diff(np.maximum.accumulate(found.received)) > 1e-6)
-    received, rows = found.received[later], found.values[later]
-    if (step := float(np.median(np.diff(received)))) > COARSE:
+    by_header = stamp == "header" and bool(np.isfinite(found.stamped).all()) and bool((found.stamped > 0).all())
+    t = found.stamped if by_header else found.received
+    order = np.argsort(t, kind="stable") if by_header else np.arange(len(t))
+    order = order[np.append(True, np.diff(np.maximum.accumulate(t[order])) > 1e-6)]
+    if len(order) < 2:  # all at one time, which is refused later with the reason
+        return replace(found, values=np.zeros((len(t), len(COLUMNS[stream]))))
+    t, rows = t[order], found.values[order]
+    if (step := float(np.median(np.diff(t)))) > COARSE:
         notes.append(f"{found.topic}: a state each {step:.2g} s is coarse: delays and lags below that do not show. Ask "
                      "the driver for 20 ms (publish_interval_ms)")
     if short_type(found.kind) == CHAIR_STATE:
-        values = chair_odometry(received, rows, *geometry)
+        values = chair_odometry(t, rows, *geometry)
         values = values if stream == "odometry" else values[:, 3:]
     else:
-        values = joint_twist(received, rows, *geometry)
+        values = joint_twist(t, rows, *geometry)
         if stream == "odometry":
-            values = np.column_stack([*integrate_speeds(received, *values.T), values])
-    return replace(found, received=received, stamped=found.stamped[later], values=values)
+            values = np.column_stack([*integrate_speeds(t, *values.T), values])
+    return replace(found, received=found.received[order], stamped=found.stamped[order], values=values)
 
 
 def _unpacked(path: Path, folder: Path) -> Path:

@@ -49,9 +49,10 @@ def chair_odometry(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: 
 
 def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
     """(T, 2) v and omega of `joint_row`s (T, 4), as `usable_joints` leaves them, at times (T,) [s]."""
-    rates = rows[:, 2:]
-    if not np.isfinite(rates).all():
-        rates = np.gradient(np.column_stack([without_wraps(angle) for angle in rows[:, :2].T]), t, axis=0)
+    angles, rates = rows[:, :2], rows[:, 2:]
+    unfilled = not rates.any() and np.ptp(angles, axis=0).any()  # of a driver that leaves them at 0; nan where no angle
+    if not np.isfinite(rates).all() or unfilled and np.isfinite(angles).all():
+        rates = np.gradient(np.column_stack([without_wraps(angle) for angle in angles.T]), t, axis=0)
     return np.column_stack(twist_of_wheels(rates[:, 0], rates[:, 1], wheel_radius, track))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sysid.logs.records import name_of
 from sysid.logs.tables.columns import QUANTITIES, Column, Table
 from sysid.logs.tables.decisions import decide, decisions_of, first_of, unused_columns
 from sysid.logs.tables.guess import guess, shown_units
@@ -61,7 +62,7 @@ def read_drives(
                                    "it lacks an input or a measurement.")
                         for table in tables if all(table is not one for one in whole)]
         else:
-            groups.append((files[0].absolute().parent.name, tables))
+            groups.append((name_of(files[0].parent), tables))
     if not groups and refused:
         raise refused[0]
     try:

@@ -20,14 +20,56 @@ BACK = (3.0, 0.1)  # usual steps, and s, by which a row may be older than the on
 def stream_rows(
     stream: str, tables: Sequence[Table], columns: Sequence[Column]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Rows of a stream in SI units in order of time, by quantity and "t", without those with an empty cell; notes."""
+    """Rows of a stream in SI units in order of time, by quantity and "t", without those with an empty cell; notes.
+
+    Columns in several files are brought to one clock.
+    """
     mine = [one for one in columns if one.role.startswith(f"{stream}.")]
-    if not mine:
-        return {}, []
-    files = {one.file for one in mine}
-    file = max(files, key=lambda name: sum(one.file == name for one in mine))  # a stream is in one file
-    mine = [one for one in mine if one.file == file]
-    table = next(one for one in tables if one.stem == file)
+    parts, notes = list[tuple[str, dict[str, np.ndarray]]](), list[str]()
+    for file in dict.fromkeys(one.file for one in mine):
+        found, said = _rows_of_file(stream, file, next(one for one in tables if one.stem == file), columns)
+        parts.append((file, found))
+        notes += said
+    if len(parts) < 2:
+        return parts[0][1] if parts else {}, notes
+    found, said = _joined(stream, parts)
+    return found, notes + said
+
+
+def _joined(
+    stream: str, parts: Sequence[tuple[str, dict[str, np.ndarray]]]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The columns of a stream that are in several files: commands hold until the next row of their file, what was
+    measured is interpolated to the rows of the file that has most columns."""
+    main, rows = max(parts, key=lambda part: len(part[1]))
+    others = [part for part in parts if part[0] != main]
+    begin, end = (pick(one["t"][at] for _, one in parts) for pick, at in ((max, 0), (min, -1)))
+    held = stream == "command"
+    t = np.unique(np.concatenate([one["t"] for _, one in parts])) if held else rows["t"]
+    t = t[t >= begin] if held else t[(t >= begin) & (t <= end)]
+    if len(t) < 2:
+        spans = "; ".join(f"{file} {one['t'][0]:.3f} to {one['t'][-1]:.3f} s" for file, one in parts)
+        raise ValueError(f"the columns of {stream} are in files that share no time ({spans}). Put them on one clock "
+                         "first.")
+    found = {"t": t}
+    for _, one in parts:
+        at = np.searchsorted(one["t"], t, side="right") - 1
+        found |= {key: values[at] if held else np.interp(t, one["t"], _going_on(key, values))
+                  for key, values in one.items() if key != "t"}
+    what = "hold until the next row of their file" if held else f"are interpolated to the times of {main}"
+    return found, [f"{stream}: {', '.join(sorted(set(one) - {'t'}))} of {file} {what}" for file, one in others]
+
+
+def _going_on(quantity: str, values: np.ndarray) -> np.ndarray:
+    """Values (T,) that may be interpolated: angles of wheels without wraps, as headings are already."""
+    return without_wraps(values) if quantity.endswith("_angle") else values
+
+
+def _rows_of_file(
+    stream: str, file: str, table: Table, columns: Sequence[Column]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """As `stream_rows`, of the columns in one file."""
+    mine = [one for one in columns if one.role.startswith(f"{stream}.") and one.file == file]
     clock = next(one for one in columns if one.role == "time" and one.file == file)
     found = {"t": clock.in_si(table.columns[clock.name]),
              **{one.role.partition(".")[2]: one.in_si(table.columns[one.name]) for one in mine}}
