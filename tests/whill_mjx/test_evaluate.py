@@ -315,7 +315,8 @@ def test_sweeps_are_read_and_bad_ones_refused():
         ("light=", "no axis"),
         ("light=-1", "light is -1.0; it must lie within 0 to 100"), ("light=0:1:1001", "more than 1000"),
         ("latency_s=99", "within 0 to 10"),
-        ("latency_s=0,0.05,0.1", "whole control periods of 0.1 s"), ("latency_s=0:0.2:4", "Give multiples"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"),
+        ("latency_s=0,0.05,0.1", "whole control periods of 0.1 s"),
+        ("latency_s=0:0.2:4", "Give multiples"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"),
         ("light=a", "could not"),
         ("light=1 light=2", "twice"), ("light=1 start_y=1 start_x=1", "one or two"), ("", "0 axes"),
     ):  # fmt: skip

@@ -198,10 +198,10 @@ def test_no_field_of_a_sensor_takes_what_makes_no_sense(kind):
 def test_late_sensors_remember_decisions_and_not_the_periods_between_them():
     """A late picture is taken in every control period; commands are remembered once a decision, as in training."""
     task = PointGoal(layout="fixed", action_repeat=2, max_steps=10)
-    env, params = make_env(task, observations={"commands": Commands(2)})
+    env, params = make_env(task, observations={"commands": Commands(3)})
 
     def act(count, state, shown, key):
-        return count + 1, jnp.stack([0.2 * count - 0.5, shown["commands"][2]])  # the speed before the last one
+        return count + 1, jnp.stack([0.2 * count - 0.5, shown["commands"][4]])  # the speed three decisions ago
 
     driver = Driver("counter", lambda state, key: jnp.zeros(()), act, period=2)
     one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], params)
@@ -209,5 +209,5 @@ def test_late_sensors_remember_decisions_and_not_the_periods_between_them():
     keys = jax.random.split(jax.random.key(0), 1)
     driven = jax.jit(lambda p: rollout(env, p, keys, driver, late, view=Seen(max_latency=1)))(one)
     shown = np.asarray(driven.trace)[0, 1::2, CHANNELS.index("action_omega")]
-    speeds = [scale_action(task, jnp.array([0.2 * count - 0.5, 0.0]))[0] for count in range(3)]
-    np.testing.assert_allclose(shown, [0.0, 0.0, *speeds], atol=1e-6)
+    speeds = [scale_action(task, jnp.array([0.2 * count - 0.5, 0.0]))[0] for count in range(2)]
+    np.testing.assert_allclose(shown, [0.0, 0.0, 0.0, *speeds], atol=1e-6)

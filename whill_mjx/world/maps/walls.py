@@ -209,8 +209,8 @@ def _heading(rotation: jax.Array) -> jax.Array:
 def horizon_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
     """(width,) rad: bearings in the world of points along the horizon of an image, without lens distortion.
 
-    One for each column; of a camera that is turned on its side, where the horizon runs from the upper to the lower edge,
-    as many along its rows.
+    One for each column. The horizon of a camera on its side runs from the upper to the lower edge: as many along its
+    rows.
     """
     share = (jnp.arange(intrinsics.width) + 0.5) / intrinsics.width
     column = (share * intrinsics.width - intrinsics.cx) / intrinsics.fx
@@ -229,8 +229,8 @@ def horizon_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
 def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: Intrinsics) -> Scene:
     """The scene with the walls of its map that this camera sees, in place of its last `keep` boxes.
 
-    As many rays as the image has columns, along its horizon, and a few beyond it on both sides find the nearest walls; a
-    scene without a map stays as it is.
+    As many rays as the image has columns, along its horizon, and a few beyond it on both sides find the nearest walls.
+    A scene without a map stays as it is.
     """
     walls = scene.walls
     if walls is None:
