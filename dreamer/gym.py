@@ -2,7 +2,8 @@
 
 The training program stays one program: at every step it calls back to the host, which moves the instances one after the
 other. That is slow beside an environment that runs on the device, but nothing else changes. The state of the instances
-lies on the host and is not part of a checkpoint: a resumed run goes on with new episodes.
+lies on the host and is not part of a checkpoint: a resumed run goes on with new episodes. So does whoever comes back to
+instances that were moved on meanwhile, by an evaluation say.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def from_gym(make: str | Callable[[], Any], instances: int = 1) -> FunctionalEnv
         return state, Transition(**parts, metrics={})
 
     def step(state: jax.Array, action: jax.Array) -> tuple[jax.Array, Transition]:
-        # The state is a count of calls. Each call needs the one before it, which keeps them in order.
+        # The state is the number of the last call. Each call needs the one before it, which keeps them in order.
         state, parts = io_callback(host.step, (count, shape), state, action)
         return state, Transition(**parts, metrics={})
 
@@ -67,15 +68,21 @@ class _Host:
         self.obs_shape, self._observe = read_observations(envs[0].observation_space)
         self.action, self._act = read_actions(envs[0].action_space)
         self._begun = [False] * len(envs)
+        self._calls = -1
 
     def reset(self, seed: Any) -> tuple[np.int32, dict[str, Any]]:
         """First frames of new episodes."""
         first = [env.reset(seed=int(seed) % 2**31 + index)[0] for index, env in enumerate(self.envs)]
         self._begun = [True] * len(self.envs)
-        return np.int32(0), self._stack([(self._observe(obs), 0.0, True, False, False) for obs in first])
+        self._calls += 1
+        return np.int32(self._calls), self._stack([(self._observe(obs), 0.0, True, False, False) for obs in first])
 
     def step(self, count: Any, action: Any) -> tuple[np.int32, dict[str, Any]]:
-        """Next frames; an episode that ended, or that a resumed run never began, begins anew."""
+        """Next frames. An episode begins anew where the last one has ended, or where the instances do not stand where
+        the caller has left them: a run was resumed, or somebody else has moved them."""
+        if int(count) != self._calls:
+            self._begun = [False] * len(self.envs)
+        self._calls += 1
         rows = []
         for index, env in enumerate(self.envs):
             if not self._begun[index]:
@@ -86,7 +93,7 @@ class _Host:
             ended = bool(terminated or truncated)
             self._begun[index] = not ended
             rows.append((self._observe(obs), float(reward), False, ended, bool(terminated)))
-        return np.int32(np.asarray(count) + 1), self._stack(rows)
+        return np.int32(self._calls), self._stack(rows)
 
     def _stack(self, rows: list[tuple]) -> dict[str, Any]:
         obs, reward, first, last, terminal = zip(*rows, strict=True)

@@ -96,6 +96,26 @@ def test_episodes_of_the_host_arrive_whole_and_begin_anew():
     np.testing.assert_allclose(steps.reward[:, 0], [-0.05, -0.05, 1.0, 0.0, -0.05])
 
 
+@pytest.mark.parametrize("moved", ["evaluated", "resumed"])
+def test_instances_that_were_moved_meanwhile_begin_anew(moved):
+    """Else the frame after an action would be one of another episode, without a mark."""
+    env = from_gym(Corridor, 2)
+    on = jnp.array([1, 1], jnp.int32)
+    state, _ = env.step(env.reset(jax.random.key(0))[0], on)
+    if moved == "evaluated":
+        other, _ = env.reset(jax.random.key(1))
+        env.step(other, on)
+    else:
+        env = from_gym(Corridor, 2)
+        env.reset(jax.random.key(0))  # as the template of a restored state does
+    state, step = env.step(state, on)
+    assert np.all(step.is_first) and not np.any(step.reward)
+    np.testing.assert_array_equal(step.obs["range"], 0.0)
+    _, step = env.step(state, on)
+    assert not np.any(step.is_first)
+    np.testing.assert_array_equal(step.obs["range"], 10.0)
+
+
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gym")

@@ -309,11 +309,14 @@ def test_sweeps_are_read_and_bad_ones_refused():
     assert first.values == (2.0, 3.0) and second.values == (-0.5, 0.0, 0.5)
     (mass,) = parse_sweep("body.mass=0.5x:1.5x:3")
     assert mass.relative and mass.values == (0.5, 1.0, 1.5) and mass.labels == ["0.5x", "1x", "1.5x"]
+    assert parse_sweep("latency_s=0:0.3:4")[0].values == (0.0, 0.1, 0.2, 0.3)
     for text, message in (
         ("wind=1", "unknown axis"), ("wing.span=1", "no effect"), ("body.colour=1", "no parameter"),
         ("light=", "no axis"),
         ("light=-1", "light is -1.0; it must lie within 0 to 100"), ("light=0:1:1001", "more than 1000"),
-        ("latency_s=99", "within 0 to 10"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"),
+        ("latency_s=99", "within 0 to 10"),
+        ("latency_s=0,0.05,0.1", "whole control periods of 0.1 s"),
+        ("latency_s=0:0.2:4", "Give multiples"), ("light=1x", "no factor"), ("body.mass=1x,2", "mixed"),
         ("light=a", "could not"),
         ("light=1 light=2", "twice"), ("light=1 start_y=1 start_x=1", "one or two"), ("", "0 axes"),
     ):  # fmt: skip

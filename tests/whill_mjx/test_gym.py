@@ -15,6 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from whill_mjx.gym import WhillEnv, kinds
 from whill_mjx.gym.kinds import as_actions
 from whill_mjx.gym.vector import WhillVectorEnv
+from whill_mjx.tasks.map_goal import MapGoal
 from whill_mjx.tasks.tasks import TASKS, ObstacleCourse
 
 SHORT = ObstacleCourse(max_steps=4)
@@ -102,6 +103,21 @@ def test_a_pickled_or_copied_environment_goes_on_where_it_was(env):
         assert other.np_random.integers(2**31) == copy.deepcopy(env.np_random).integers(2**31)
 
 
+def test_a_copied_vector_of_a_map_goes_on_where_it_was():
+    """Its state knows the map's walls, and they must be those in which the next episode begins."""
+    env = WhillVectorEnv(1, MapGoal(map="made:1", max_steps=2), observations=("goal",))
+    env.reset(seed=0)
+    env.step(STILL[None])
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        for _ in range(3):
+            theirs = other.step(STILL[None])
+        assert theirs[0]["goal"].shape == (1, 2)
+        assert other._kind.step_or_reset._cache_size() == 1  # nothing is compiled again
+    for _ in range(3):
+        ours = env.step(STILL[None])
+    np.testing.assert_array_equal(ours[0]["goal"], theirs[0]["goal"])
+
+
 def test_options_change_the_episode_and_unknown_ones_are_refused(env):
     env.reset(seed=1)
     _, info = env.reset(seed=1, options={"start_y": 0.25})
@@ -181,6 +197,14 @@ def test_forked_workers_are_refused_at_once_with_the_remedy(env):
             workers.reset(seed=0)
     finally:
         workers.close(terminate=True)
+
+
+@pytest.mark.quick
+def test_a_video_runs_at_the_speed_of_the_simulation():
+    assert WhillEnv(**SMALL).metadata["render_fps"] == 10.0
+    slow = {**SMALL, "task": ObstacleCourse(max_steps=4, action_repeat=5)}
+    assert WhillEnv(**slow).metadata["render_fps"] == WhillVectorEnv(1, **slow).metadata["render_fps"] == 2.0
+    assert WhillEnv.metadata["render_fps"] == 10
 
 
 def test_a_video_is_recorded(tmp_path):

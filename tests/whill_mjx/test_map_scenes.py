@@ -174,6 +174,29 @@ def test_a_camera_sees_the_walls_that_all_walls_would_show():
     assert float(wrong(starts).mean()) <= 0.01
 
 
+def test_a_camera_on_its_side_or_its_head_sees_the_walls_that_all_walls_would_show():
+    """The horizon of a camera on its side runs from the upper to the lower edge of the image."""
+    made = make_map_scene(many_rooms(), keep=64)
+    scene, _ = map_scene_sampler(made)(jax.random.key(0))
+    segments = jnp.asarray(made.walls.segments)
+    every = wall_boxes(segments, jnp.arange(len(segments)), jnp.ones(len(segments), bool), 2.2, (0.8, 0.8, 0.7))
+    lens = pinhole(1.0, 48, 64)
+
+    @jax.jit
+    @jax.vmap
+    def wrong(start, pitch, roll):
+        position, rotation = jnp.append(start[:2], 1.0), camera_rotation(start[2], pitch, roll)
+        one = render_frame(position, rotation, lens, shown(scene, position, rotation, lens)).depth
+        all_of = render_frame(position, rotation, lens, dataclasses.replace(scene, boxes=every, walls=None)).depth
+        return jnp.mean((jnp.abs(one - all_of) > 0.05) | (jnp.isfinite(one) != jnp.isfinite(all_of)))
+
+    starts = jnp.asarray(made.places.start[::256], jnp.float32)
+    for roll in (np.pi / 2, -np.pi / 2, np.pi):
+        for pitch in (0.0, 0.4):
+            share = wrong(starts, jnp.full(len(starts), pitch), jnp.full(len(starts), roll))
+            assert float(share.mean()) < 0.01, (roll, pitch)
+
+
 @pytest.mark.parametrize("pitch", [0.0, 0.4, 0.8])
 def test_a_camera_that_looks_down_sees_the_walls_beside_its_horizon(pitch):
     """A pillar to the left, which lies in the lower corner of the image, and beyond the bearings of its horizon."""

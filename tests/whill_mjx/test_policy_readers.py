@@ -126,6 +126,18 @@ def test_the_camera_of_a_policy_file_is_that_of_the_vehicle_after_it_has_settled
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize("mount", [{"roll": 3.0}, {"roll": -2.0, "yaw": 0.4}, {"roll": 1.5707963, "pitch": 0.3},
+                                   {"pitch": 1.6}, {"roll": 3.14159, "yaw": 3.0}])  # fmt: skip
+def test_a_policy_file_states_how_a_camera_on_its_head_or_side_is_turned(mount):
+    spec, params = preset("whill_cr_ramp")
+    model = build_model(dataclasses.replace(spec, camera=dataclasses.replace(spec.camera, **mount)))
+    stated = camera_contract(model, params)
+    _, rotation = camera_pose(model, place(model, params, 0.0, 0.0, 0.0).qpos)
+    turned = camera_rotation(*(jnp.asarray(stated[angle]) for angle in ("yaw", "pitch", "roll")))
+    np.testing.assert_allclose(turned, rotation, atol=1e-3)
+
+
+@pytest.mark.quick
 def test_the_chair_with_its_suspension_looks_up_by_what_it_sinks():
     spec, params = preset("whill_cr_ramp")
     assert spec.camera.pitch == 0.15

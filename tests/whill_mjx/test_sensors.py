@@ -13,6 +13,10 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, reset, reset_state, sense, step_state
+from whill_mjx.evaluation.conditions import nominal
+from whill_mjx.evaluation.drivers import Driver
+from whill_mjx.evaluation.rollouts import CHANNELS, rollout
+from whill_mjx.evaluation.rollouts import View as Seen
 from whill_mjx.learning.setup import obs_shape_of
 from whill_mjx.sensors.base import Reading, Sensor, View
 from whill_mjx.sensors.camera import Camera
@@ -24,6 +28,8 @@ from whill_mjx.sensors.lidar import Lidar, distances
 from whill_mjx.sensors.lidar3d import Lidar3D
 from whill_mjx.sensors.odometry import Odometry
 from whill_mjx.sensors.registry import known_sensors
+from whill_mjx.tasks.point_goal import PointGoal
+from whill_mjx.tasks.tasks import scale_action
 from whill_mjx.world.scene import box, stack_boxes
 
 
@@ -187,3 +193,21 @@ def test_no_field_of_a_sensor_takes_what_makes_no_sense(kind):
         for value in (math.nan, math.inf, 1e12, -1e12, "x", True):
             with pytest.raises(ValueError, match=f"^sensor {kind.__name__}: {name} is "):
                 kind(**{name: value})
+
+
+def test_late_sensors_remember_decisions_and_not_the_periods_between_them():
+    """A late picture is taken in every control period; commands are remembered once a decision, as in training."""
+    task = PointGoal(layout="fixed", action_repeat=2, max_steps=10)
+    env, params = make_env(task, observations={"commands": Commands(3)})
+
+    def act(count, state, shown, key):
+        return count + 1, jnp.stack([0.2 * count - 0.5, shown["commands"][4]])  # the speed three decisions ago
+
+    driver = Driver("counter", lambda state, key: jnp.zeros(()), act, period=2)
+    one = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], params)
+    late = jax.tree.map(lambda leaf: leaf[None], dataclasses.replace(nominal(), latency=jnp.ones(())))
+    keys = jax.random.split(jax.random.key(0), 1)
+    driven = jax.jit(lambda p: rollout(env, p, keys, driver, late, view=Seen(max_latency=1)))(one)
+    shown = np.asarray(driven.trace)[0, 1::2, CHANNELS.index("action_omega")]
+    speeds = [scale_action(task, jnp.array([0.2 * count - 0.5, 0.0]))[0] for count in range(2)]
+    np.testing.assert_allclose(shown, [0.0, 0.0, 0.0, *speeds], atol=1e-6)

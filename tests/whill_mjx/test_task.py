@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from whill_mjx.tasks.docking import Docking
+from whill_mjx.tasks.point_goal import PointGoal
 from whill_mjx.tasks.tasks import (
     Corridor,
     ObstacleCourse,
@@ -18,6 +20,7 @@ from whill_mjx.tasks.tasks import (
     sample_world,
     scale_action,
 )
+from whill_mjx.tasks.terms import Moment
 from whill_mjx.vehicle.specs import WHILL_CR
 from whill_mjx.vehicle.types import Body, VehicleParams
 from whill_mjx.world.randomize import randomize_looks, randomize_params
@@ -128,6 +131,34 @@ def test_goal_of_the_course_is_about_five_metres_away_and_gates_are_lower_than_t
 
 def test_one_gate_leaves_out_the_second():
     assert sample_world(ObstacleCourse(gates=1), jax.random.key(0)).scene.boxes.mask.shape == (5,)
+
+
+@pytest.mark.parametrize("farthest", [2.5, 3.5, 9.0])
+def test_every_point_goal_lies_within_the_walls(farthest):
+    """A goal behind a wall would be one that nobody reaches."""
+    task = PointGoal(farthest=farthest)
+    found = worlds(task)
+    inner = float(found.scene.boxes.centre[0, 0, 1] - found.scene.boxes.half[0, 0, 1])  # of the wall to the left
+    goals = np.asarray(found.scene.marker.position)[:, :2]
+    assert inner - np.abs(goals).max() >= task.goal_radius - 1e-5
+    assert inner == pytest.approx(max(4.0, farthest + 0.5))
+
+
+@pytest.mark.parametrize(("twist", "docked"), [((0.03, 0.0), True), ((0.0, 0.05), True), ((0.0, 0.8), False),
+                                               ((0.06, 0.0), False), ((0.03, -0.06), False)])  # fmt: skip
+def test_a_vehicle_has_docked_where_it_neither_drives_nor_turns(twist, docked):
+    """The chair's farthest corner is 0.8 m from its driven axle: it moves at 0.05 m/s where it turns at 0.06 rad/s."""
+    task = Docking(layout="fixed")
+    scene = sample_world(task, jax.random.key(0)).scene
+    x, y, yaw = *goal_position(scene), scene.marker.yaw
+    zero = jnp.zeros(())
+    moment = Moment(
+        scene, jnp.stack([x, y, yaw]), jnp.array(twist), footprint(WHILL_CR, x, y, yaw), jnp.zeros(2), jnp.zeros(2),
+        zero, zero, NO, YES, NO, zero,
+    )  # fmt: skip
+    assert bool(task.docked(moment)) is docked
+    assert bool(task.endings(moment)["success"]) is docked
+    assert (float(task.rewards(moment)["goal"]) > 0) is docked
 
 
 @pytest.mark.parametrize("wrong", [{"layout": "maze"}, {"v_min": 1.0}, {"action_repeat": 0}])

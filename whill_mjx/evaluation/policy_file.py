@@ -129,9 +129,9 @@ def camera_contract(model: VehicleModel, params: VehicleParams) -> dict[str, Any
     """
     level = dataclasses.replace(params, effects=tuple(e for e in params.effects if not _is_ground(model, e)))
     position, rotation = camera_pose(model, place(model, level, 0.0, 0.0, 0.0).qpos)
-    right, _, forward = np.asarray(rotation, np.float64).T
-    pitch = np.arcsin(-forward[2])
-    angles = {"roll": np.arcsin(-right[2] / np.cos(pitch)), "pitch": pitch, "yaw": np.arctan2(forward[1], forward[0])}
+    right, down, forward = np.asarray(rotation, np.float64).T
+    angles = {"roll": np.arctan2(-right[2], -down[2]), "pitch": np.arcsin(np.clip(-forward[2], -1.0, 1.0)),
+              "yaw": np.arctan2(forward[1], forward[0])}  # fmt: skip
     lengths = dict(zip("xyz", np.asarray(position, np.float64), strict=True))
     return {
         "frame": "base_footprint",

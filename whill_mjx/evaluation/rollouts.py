@@ -208,11 +208,14 @@ class _Episodes:
         return states, memory, jnp.clip(action, -1.0, 1.0), image, past
 
     def _hold(self, loop: dict[str, Any]) -> tuple[State, Any, jax.Array, Any, Any]:
-        """The same where it keeps its action; pictures arrive between the decisions too."""
-        states, image, past = loop["states"], loop["image"], loop["past"]
+        """The same where it keeps its action. Pictures arrive between the decisions too.
+
+        Sensors remember what they measured at decisions alone, as in the training, whose steps are decisions.
+        """
+        image, past = loop["image"], loop["past"]
         if self.view.max_latency:
-            states, image, past = self._see(loop["step"], states, past)
-        return states, loop["memory"], loop["action"], image, past
+            _, image, past = self._see(loop["step"], loop["states"], past)
+        return loop["states"], loop["memory"], loop["action"], image, past
 
 
 def _row(env: Env, state: State, action: jax.Array) -> jax.Array:

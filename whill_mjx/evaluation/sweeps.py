@@ -23,6 +23,7 @@ from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures
 from whill_mjx.evaluation.intervals import wilson_interval
 from whill_mjx.io.command_line import check_once
 from whill_mjx.io.fields import CONDITION, check
+from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.world.randomize import check_parameter, with_parameter
 
 CONDITIONS = tuple(name for name in NAMES if name != "latency") + ("latency_s",)
@@ -119,9 +120,17 @@ def _parse_axis(text: str) -> Axis:
     if name in CONDITION:
         for value in ends:
             check(f"{text!r}", CONDITION[name], value)
+        _check_periods(text, name, numbers)
     elif "." in name:
         check_parameter(f"axis {name!r}", name, ends, relative)
     return Axis(name, tuple(float(np.round(number, 9)) for number in numbers), relative)
+
+
+def _check_periods(text: str, name: str, values: np.ndarray) -> None:
+    """Refuse latencies that are no whole number of control periods: what was driven would be another one."""
+    period = VehicleConfig().control_dt
+    if name == "latency_s" and not np.allclose(values / period, np.round(values / period), atol=1e-6):
+        raise ValueError(f"{text!r}: images are late by whole control periods of {period:g} s. Give multiples of it.")
 
 
 def _check_name(name: str) -> None:

@@ -75,6 +75,7 @@ class WhillEnv(Carried, gymnasium.Env):
         self._kind = kind
         self.env, self.params = kind.batch.env, kind.batch.params
         self.observation_space, self.action_space = kind.observation_space, kind.action_space
+        self.metadata = {**self.metadata, "render_fps": kind.steps_per_second}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; the same seed gives the same world.

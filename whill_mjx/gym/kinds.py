@@ -44,6 +44,12 @@ class Kind:
     observation_space: gymnasium.Space
     action_space: gymnasium.spaces.Box
 
+    @property
+    def steps_per_second(self) -> float:
+        """Environment steps in a second of the simulated time: the frame rate of a video."""
+        env = self.batch.env
+        return round(1.0 / (env.model.config.control_dt * env.task.action_repeat), 6)
+
     @cached_property
     def reset(self) -> Any:
         """(origin, condition or None) -> state and first time step of one instance."""

@@ -76,6 +76,7 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = kind.observation_space, kind.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.metadata = {**self.metadata, "render_fps": kind.steps_per_second}
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

@@ -56,7 +56,7 @@ class Docking(Task):
     heading_tolerance: float = 0.14
     """Largest deviation from the direction of the dock [rad]."""
     rest_speed: float = 0.05
-    """Largest speed that counts as standing [m/s]."""
+    """Largest speed of a corner of the vehicle that counts as standing [m/s]."""
     alignment_gain: float = 0.5
     """Reward lost in each period per rad of deviation from the dock's direction, within 1 m of it."""
 
@@ -74,9 +74,9 @@ class Docking(Task):
         return World(Scene(stack_boxes(boxes), marker, default_looks()), jnp.zeros(3))
 
     def docked(self, moment: Moment) -> jax.Array:
-        """() bool."""
+        """() bool: at the dock, along it, and no corner of the vehicle moves faster than `rest_speed`."""
         straight = jnp.abs(terms.heading_error(moment, moment.scene.marker.yaw)) < self.heading_tolerance
-        return moment.reached & straight & (jnp.abs(moment.twist[0]) < self.rest_speed)
+        return moment.reached & straight & (terms.fastest_corner(moment) < self.rest_speed)
 
     def rewards(self, moment: Moment) -> dict[str, jax.Array]:
         turned = jnp.abs(terms.heading_error(moment, moment.scene.marker.yaw))

@@ -18,6 +18,8 @@ from whill_mjx.tasks.base import COMMON_SWEEPS, Budget, Task, World
 from whill_mjx.tasks.parts import OBSTACLES, make_marker, room
 from whill_mjx.world.scene import Scene, box, default_looks, stack_boxes
 
+HALF = 4.0
+"""Half the edge of the square, if no goal needs a larger one [m]."""
 AROUND_START, AROUND_GOAL = 1.4, 1.1
 """Boxes whose middle is nearer than this to the start or to the goal are left out [m]."""
 
@@ -25,6 +27,8 @@ AROUND_START, AROUND_GOAL = 1.4, 1.1
 @dataclass(frozen=True)
 class PointGoal(Task):
     """Drive to a point 2 to 3.5 m away in any direction, between up to five boxes, in a square of 8 m.
+
+    Goals that are farther away make the square larger.
 
     The vehicle knows where the goal is, scans what is around it, and knows its last command; it needs no camera.
     """
@@ -61,7 +65,7 @@ class PointGoal(Task):
         heading = draw(-math.pi, math.pi, fixed=0.0)
         distance, bearing = draw(self.nearest, self.farthest, fixed=2.7), draw(-math.pi, math.pi, fixed=0.5)
         goal = distance * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)])
-        boxes = [room(4.0)]
+        boxes = [room(max(HALF, self.farthest + self.goal_radius))]
         for number in range(self.boxes):
             angle = 2 * math.pi * number / self.boxes + draw(-0.6, 0.6, fixed=0.0)
             away, edge, turned = draw(1.2, 3.2, fixed=2.0), draw(0.3, 0.6, fixed=0.4), draw(0.0, 1.5, fixed=0.0)

@@ -47,6 +47,14 @@ def speed_change(moment: Moment) -> jax.Array:
     return jnp.abs(moment.command[0] - moment.previous_command[0])
 
 
+def fastest_corner(moment: Moment) -> jax.Array:
+    """() m/s, speed of that corner of the vehicle which moves fastest: it drives ahead and turns."""
+    body, (v, omega) = moment.body, moment.twist
+    to_centre = to_body(moment.pose, jnp.stack([body.x, body.y]))[0]  # of the body, ahead of the driven axle
+    reach = jnp.abs(to_centre) + body.half_length
+    return jnp.hypot(jnp.abs(v) + jnp.abs(omega) * body.half_width, omega * reach)
+
+
 def shortfall(moment: Moment, margin: float) -> jax.Array:
     """() m by which the distance to the nearest thing falls short of a margin."""
     return jnp.maximum(margin - free_distance(moment.body, moment.scene), 0.0)

@@ -5,7 +5,9 @@ World frame: x forward along the course, y left, z up, ground at z = 0. Lengths 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -63,7 +65,10 @@ class Looks:
 
 @dataclass(frozen=True, eq=False)
 class MapWalls:
-    """Walls of a map. Static, and shared by all instances: a map of thousands of walls is stored once."""
+    """Walls of a map. Static, and shared by all instances: a map of thousands of walls is stored once.
+
+    Walls with the same content are equal: a state that was copied, or read from a file, stays one of the same map.
+    """
 
     segments: np.ndarray
     """(S, 2, 2) float32: both ends of each wall, x and y [m]; the free space lies to the left of its way."""
@@ -81,6 +86,21 @@ class MapWalls:
     """Its rows and columns."""
     within: float
     """How far from any place of a square the walls are listed [m]."""
+
+    @cached_property
+    def content(self) -> str:
+        """Checksum of all fields."""
+        found = hashlib.sha256()
+        for one in fields(self):
+            value = np.asarray(getattr(self, one.name))
+            found.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
+        return found.hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, MapWalls) and self.content == other.content)
+
+    def __hash__(self) -> int:
+        return hash(self.content)
 
     def cell(self, x: jax.Array, y: jax.Array) -> jax.Array:
         """Line of `near` for a place; the nearest square for one outside."""

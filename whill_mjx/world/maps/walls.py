@@ -175,39 +175,62 @@ def distances_to(segments: jax.Array, x, y) -> jax.Array:
 def bearings(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
     """(width + 2 BESIDE,) rad: bearings in the world of all that an image shows, without lens distortion.
 
-    Those of the horizon's point in each column, and those that lie beyond them on both sides: a camera that looks down
-    sees more aside at its lower edge than on the horizon. At most `WIDEST` to either side of its heading.
+    Those of the horizon's points, and those that lie beyond them on both sides: a camera that looks down sees more
+    aside at its lower edge than on the horizon. At most `WIDEST` to either side of its heading.
     """
-    columns = column_angles(rotation, intrinsics)
+    level = horizon_angles(rotation, intrinsics)
     u = (jnp.array([0.0, intrinsics.width]) - intrinsics.cx) / intrinsics.fx
     v = (jnp.array([0.0, intrinsics.height]) - intrinsics.cy) / intrinsics.fy
     corner = rotation[:2, 0] * u[:, None, None] + rotation[:2, 1] * v[:, None] + rotation[:2, 2]  # (2, 2, 2)
-    ahead = rotation[:2, 2] + rotation[2, 2] * rotation[:2, 1]  # that of its upper edge where it looks straight down
-    c, s = ahead / jnp.maximum(jnp.linalg.norm(ahead), 1e-6)
+    c, s = _heading(rotation)
     deep, aside = corner[..., 0] * c + corner[..., 1] * s, corner[..., 1] * c - corner[..., 0] * s
     slope = jnp.clip(aside / jnp.maximum(deep, 1e-6), -WIDEST, WIDEST)
     heading, share = jnp.arctan2(s, c), (jnp.arange(BESIDE) + 1.0) / BESIDE
-    edges = jnp.clip(jnp.tan(columns[jnp.array([0, -1])] - heading), -WIDEST, WIDEST)
+    edges = jnp.clip(jnp.tan(level[jnp.array([0, -1])] - heading), -WIDEST, WIDEST)
+    edges = jnp.stack([edges.max(), edges.min()])  # to the left, to the right
     ends = jnp.stack([jnp.maximum(slope.max(), edges[0]), jnp.minimum(slope.min(), edges[1])])
     beyond = edges[:, None] + (ends - edges)[:, None] * share
-    return jnp.concatenate([columns, (heading + jnp.arctan(beyond)).ravel()])
+    return jnp.concatenate([level, (heading + jnp.arctan(beyond)).ravel()])
 
 
-def column_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
-    """(width,) rad: bearing in the world of the horizon's point in each column of an image, without lens distortion."""
-    u = (jnp.arange(intrinsics.width) + 0.5 - intrinsics.cx) / intrinsics.fx
+def _heading(rotation: jax.Array) -> jax.Array:
+    """(2,) unit vector x, y: where a camera looks on the ground plane, whatever its roll.
+
+    Of a level camera that is its line of sight; of one that looks straight down or up, what lies towards the horizon
+    in its image. The sum of both leads from one to the other.
+    """
+    up = rotation[2, :2]  # of the world, in the image
+    size = jnp.linalg.norm(up)
+    up = jnp.where(size < 1e-6, jnp.array([0.0, -1.0]), up / jnp.maximum(size, 1e-6))
+    ahead = rotation[:2, 2] - rotation[2, 2] * (rotation[:2, 0] * up[0] + rotation[:2, 1] * up[1])
+    return ahead / jnp.maximum(jnp.linalg.norm(ahead), 1e-6)
+
+
+def horizon_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
+    """(width,) rad: bearings in the world of points along the horizon of an image, without lens distortion.
+
+    One for each column. The horizon of a camera on its side runs from the upper to the lower edge: as many along its
+    rows.
+    """
+    share = (jnp.arange(intrinsics.width) + 0.5) / intrinsics.width
+    column = (share * intrinsics.width - intrinsics.cx) / intrinsics.fx
+    row = (share * intrinsics.height - intrinsics.cy) / intrinsics.fy
     # On the horizon a ray has no height: z = R[2,0] u + R[2,1] v + R[2,2] = 0.
-    down = jnp.where(jnp.abs(rotation[2, 1]) < 1e-6, 1e-6, rotation[2, 1])
-    v = -(rotation[2, 0] * u + rotation[2, 2]) / down
-    x, y = (rotation[row, 0] * u + rotation[row, 1] * v + rotation[row, 2] for row in range(2))
+    across, down, depth = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    upright = jnp.abs(down) >= jnp.abs(across)
+    steep = jnp.where(upright, down, across)
+    steep = jnp.where(jnp.abs(steep) < 1e-6, 1e-6, steep)
+    met = -(jnp.where(upright, across * column, down * row) + depth) / steep
+    u, v = jnp.where(upright, column, met), jnp.where(upright, met, row)
+    x, y = (rotation[axis, 0] * u + rotation[axis, 1] * v + rotation[axis, 2] for axis in range(2))
     return jnp.arctan2(y, x)
 
 
 def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: Intrinsics) -> Scene:
     """The scene with the walls of its map that this camera sees, in place of its last `keep` boxes.
 
-    One ray per image column, along the horizon, and a few beyond it on both sides find the nearest walls; a scene
-    without a map stays as it is.
+    As many rays as the image has columns, along its horizon, and a few beyond it on both sides find the nearest walls.
+    A scene without a map stays as it is.
     """
     walls = scene.walls
     if walls is None:
