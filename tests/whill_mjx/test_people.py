@@ -17,7 +17,7 @@ from whill_mjx.world.materials import label_count
 from whill_mjx.world.people import body, law
 from whill_mjx.world.people.around import near_in
 from whill_mjx.world.people.contact import poses_among_people, scene_with_people, walk_around
-from whill_mjx.world.people.crowd import Crowd, join, people_on, scripted
+from whill_mjx.world.people.crowd import TRUNK, Crowd, join, people_on, scripted
 from whill_mjx.world.people.places import in_sight
 from whill_mjx.world.scene import Footprint, Marker, Scene, box, default_looks, no_boxes, stack_boxes
 from whill_mjx.world.solids import Solids, rod, stack_rounds
@@ -55,6 +55,10 @@ def walker(*points, speed=1.3, yielding=True):
         one, speed=jnp.full(1, speed), velocity=speed * way[None], yields=jnp.full(1, yielding),
         returns=jnp.zeros(1, bool),
     )  # fmt: skip
+
+
+def stander(x, y=0.0):
+    return dataclasses.replace(walker([x, y], [x + 0.1, y], speed=0.0, yielding=False), velocity=jnp.zeros((1, 2)))
 
 
 STEPS = 160
@@ -205,8 +209,7 @@ def test_who_walked_into_the_side_of_a_standing_vehicle_goes_on():
 
 @pytest.mark.parametrize("aside", [0.0, 0.3, 0.38])
 def test_a_vehicle_that_drives_into_somebody_collides_where_it_touches(aside):
-    standing = walker([1.5, aside], [1.6, aside], speed=0.0, yielding=False)
-    scene = scene_with_people(EMPTY, dataclasses.replace(standing, velocity=jnp.zeros((1, 2))), jax.random.key(0))
+    scene = scene_with_people(EMPTY, stander(1.5, aside), jax.random.key(0))
     path = np.zeros((9, 3))
     path[:, 0] = 0.167 * np.arange(9)
     scenes, collided, share = met(scene, path)
@@ -225,6 +228,62 @@ def test_nobody_passes_through_the_vehicle_between_two_steps():
     scenes, collided, share = met(scene, path)
     assert collided.any() or scenes.people.held.any()
     assert gaps(scenes, path[1:])[: int(np.argmax(collided)) or 1].min() > -5e-3
+
+
+LINE = 0.02
+"""Thickness of a wall [m]: less than a step."""
+BEFORE_A_WALL = scene_of(stack_boxes([box(0.0, -LINE / 2, 9.0, LINE, 2.0, jnp.ones(3))] * 2))
+
+
+def test_nobody_is_pushed_through_a_wall():
+    person = walker([0.0, law.RADIUS], [3.0, law.RADIUS], speed=1.86)
+    scene = scene_with_people(BEFORE_A_WALL, person, jax.random.key(0))
+    path = np.zeros((4, 3))
+    path[:, 1] = law.RADIUS + TRUNK * float(person.height[0]) + 0.01 + HALF[1] - 0.167 * np.arange(4)
+    scenes, collided, _ = met(scene, path)
+    assert collided[0] and float(scenes.people.position[0, 0, 1]) > law.RADIUS - 1e-3
+
+
+@pytest.mark.parametrize("time", [0.1, 0.3])
+def test_who_steps_back_stops_at_a_wall(time):
+    person = walker([0.0, 0.2], [3.0, 0.2])
+    one = jnp.ones(1)
+    mover = law.Mover(jnp.array([0.0, 0.68]), jnp.array([1.0, 0.0]), jnp.array(HALF), jnp.zeros(2), jnp.zeros(()))
+    step = law.stepped_back(person, near_in(BEFORE_A_WALL), mover, time * one)
+    np.testing.assert_allclose(step, [[0.0, law.RADIUS - 0.2]], atol=1e-5)
+    along = dataclasses.replace(person, position=jnp.array([[0.8, law.RADIUS - 1e-5]]))  # beside both
+    mover = mover._replace(centre=jnp.array([0.0, law.RADIUS - 1e-5]))
+    step = law.stepped_back(along, near_in(BEFORE_A_WALL), mover, time * one)
+    np.testing.assert_allclose(step, [[time * 1.3, 0.0]], atol=1e-5)
+
+
+def test_who_yields_keeps_off_a_vehicle_that_turns_in_a_long_period():
+    person = walker([0.0, 0.6], [0.0, 0.61])
+    mover = law.Mover(jnp.zeros(2), jnp.array([1.0, 0.0]), jnp.array([0.7, 0.3]), jnp.zeros(2), jnp.array(np.pi / 2))
+    after = jax.jit(lambda people: law.walk(people, near_in(EMPTY), mover, 1.0))(person)
+    x, y = (float(value) for value in jnp.abs(after.position[0]))
+    assert np.hypot(max(x - 0.3, 0.0), max(y - 0.7, 0.0)) > TRUNK * float(person.height[0])  # its length is along y
+
+
+def test_a_vehicle_that_has_crept_into_somebody_collides_when_it_drives_on():
+    scene = scene_with_people(EMPTY, stander(0.7), jax.random.key(0))
+    creeps, drives = np.full(26, 0.004), np.full(2, 0.05)  # 0.04 m/s counts as standing
+    path = np.zeros((29, 3))
+    path[1:, 0] = np.cumsum(np.concatenate([creeps, drives]))
+    scenes, collided, _ = met(scene, path)
+    assert int(scenes.people.bumped.sum()) == 1 and not collided[:26].any()
+    assert gaps(scenes, path[1:])[25] < -0.05 and collided[26]
+
+
+def test_who_would_have_walked_into_the_vehicle_after_it_stopped_has_not():
+    ahead, path = stander(0.75), np.array([[0.0, 0.0, 0.0], [0.16, 0.0, 0.0]])
+    nobody = dataclasses.replace(ahead, there=jnp.zeros(1, bool))
+    beside = dataclasses.replace(walker([0.0, 0.57], [0.0, -3.0], yielding=False), phase=jnp.zeros(1))
+    for first, walks_into in ((ahead, False), (nobody, True)):
+        scene = scene_with_people(EMPTY, join(first, beside), jax.random.key(0))
+        scenes, collided, share = met(scene, path)
+        assert bool(collided[0]) != walks_into and bool(scenes.people.held[0, 1]) == walks_into
+        assert 0.1 < float(share[0]) < 0.6 or walks_into
 
 
 def test_a_vehicle_may_leave_somebody_who_touches_it():

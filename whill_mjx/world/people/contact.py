@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -63,22 +64,56 @@ def poses_among_people(speed: float, yaw_rate: float, duration: float, half_leng
     return max(1, math.ceil(duration * fastest / DEPTH))
 
 
-def _distances_to(people: People, first: Ends, last: Ends) -> Callable[[Footprint, jax.Array], jax.Array]:
-    """(vehicle, share () of the period) -> (N,) m from it to each person, whose parts move from `first` to `last`."""
-    radius = people.height[:, None] * jnp.array(body.RADII)[: body.TOUCHING]
+class Capsules(NamedTuple):
+    """Those of N people over a period, in which the ends of their axes move evenly."""
 
-    def apart(footprint: Footprint, share: jax.Array) -> jax.Array:
-        start, end = (a[:, : body.TOUCHING] + share * (b - a)[:, : body.TOUCHING]
-                      for a, b in zip(first, last, strict=True))  # fmt: skip
-        low = jnp.minimum(start[..., 2], end[..., 2]) - radius
-        there = jnp.broadcast_to(people.there[:, None], low.shape)
-        parts = (start[..., :2], end[..., :2], radius, low, there)
-        stadiums = Stadiums(*(part.reshape(-1, *part.shape[2:]) for part in parts))
-        far = distances(footprint, stadiums)
-        met = stadiums.mask & (stadiums.low < footprint.height)
-        return jnp.where(met, far, jnp.inf).reshape(-1, body.TOUCHING).min(-1)
+    height: jax.Array  # (N,) m, of the people
+    there: jax.Array  # (N,) bool
+    first: Ends
+    last: Ends
 
-    return apart
+
+def _distances(capsules: Capsules, vehicle: Footprint, share: jax.Array) -> jax.Array:
+    """(N,) m from a vehicle to each person at a share () of the period."""
+    start, end = (a + share * (b - a) for a, b in zip(capsules.first, capsules.last, strict=True))
+    radius = capsules.height[:, None] * jnp.array(body.RADII)[: body.TOUCHING]
+    low = jnp.minimum(start[..., 2], end[..., 2]) - radius
+    there = jnp.broadcast_to(capsules.there[:, None], low.shape)
+    parts = (start[..., :2], end[..., :2], radius, low, there)
+    stadiums = Stadiums(*(part.reshape(-1, *part.shape[2:]) for part in parts))
+    far = distances(vehicle, stadiums)
+    met = stadiums.mask & (stadiums.low < vehicle.height)
+    return jnp.where(met, far, jnp.inf).reshape(-1, body.TOUCHING).min(-1)
+
+
+class Touches(NamedTuple):
+    """Where the vehicle first touches each person on its way."""
+
+    touched: jax.Array  # (N,) bool
+    low: jax.Array  # (N,) share of the way at which it does not yet
+    high: jax.Array  # (N,) share at which it does
+    nearer: jax.Array  # (N,) m by which it is then nearer than a whole period earlier, had the person stood there
+
+
+def _first_touches(capsules: Capsules, vehicle: Callable[[jax.Array], Footprint], poses: int) -> Touches:
+    """First touches of people by a vehicle, which is a function of the share () of the period."""
+    shares = jnp.arange(1, poses + 1) / poses
+    hits = jax.vmap(lambda share: _distances(capsules, vehicle(share), share) <= 0.0)(shares)  # (poses, N)
+    touched, index = hits.any(0), jnp.argmax(hits, 0)
+    low, high = index / poses, (index + 1) / poses
+
+    @jax.vmap
+    def own(capsule, share, back):
+        return _distances(jax.tree.map(lambda leaf: leaf[None], capsule), vehicle(share - back), share)[0]
+
+    now, earlier = jnp.zeros(touched.shape), jnp.ones(touched.shape)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        there = own(capsules, middle, now) <= 0.0
+        low, high = jnp.where(there, low, middle), jnp.where(there, middle, high)
+    # The distance is not 0 where the vehicle has crept into somebody who could not step back.
+    nearer = own(capsules, high, earlier) - own(capsules, high, now)
+    return Touches(touched, low, high, nearer)
 
 
 def walk_around(
@@ -103,7 +138,9 @@ def walk_around(
     # The barriers keep XLA from computing the walk and the contacts again for each thing that needs them.
     walked = jax.lax.optimization_barrier(walked)
     last = jax.lax.optimization_barrier(body.skeleton(walked))
-    apart = _distances_to(people, first, last)
+    capsules = Capsules(people.height, people.there, *(
+        tuple(ends[:, : body.TOUCHING] for ends in both) for both in (first, last)
+    ))  # fmt: skip
     turn = duration * mover.yaw_rate
 
     def vehicle(share):
@@ -114,25 +151,13 @@ def walk_around(
             yaw=before.yaw + share * turn,
         )
 
-    shares = jnp.arange(1, poses + 1) / poses
-    hits = jax.vmap(lambda share: apart(vehicle(share), share) <= 0.0)(shares)  # (poses, N)
-    touched = hits.any(0)
-    index = jnp.argmax(hits, 0)
-    low, high = index / poses, (index + 1) / poses
-    row = jnp.arange(people.speed.shape[0])
-    own = jax.vmap(lambda share, one, back: apart(vehicle(share - back), share)[one])
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        there = own(middle, row, jnp.zeros(row.shape)) <= 0.0
-        low, high = jnp.where(there, low, middle), jnp.where(there, middle, high)
-    # By how much a vehicle that goes a whole period back is farther from where the person is at the contact.
-    approach = own(high, row, jnp.ones(row.shape)) / duration
-    ran_into = touched & (approach > STANDING)
+    touched, low, high, nearer = _first_touches(capsules, vehicle, poses)
+    ran_into = touched & (nearer > STANDING * duration)
     collided = ran_into.any()
     share = jnp.min(jnp.where(ran_into, high, 1.0), initial=1.0)
     kept = jnp.where(touched, jnp.minimum(low, share), share)  # (N,) how far each person gets
     kept, touched, ran_into = jax.lax.optimization_barrier((kept, touched, ran_into))
-    stopped = touched & ~ran_into
+    stopped = touched & ~ran_into & (high <= share)  # the vehicle stops where it ran into somebody
     people_after = _between(people, walked, kept, stopped)
     start, end = (a + kept[:, None, None] * (b - a) for a, b in zip(first, last, strict=True))
     later = mover_of(vehicle(share), after, duration)

@@ -68,7 +68,7 @@ def walk(people: People, near, mover: Mover | None, duration: float) -> People:
     for _ in range(steps):
         people = _one_step(people, near, mover, dt)
         if mover is not None:
-            mover = mover._replace(centre=mover.centre + dt * mover.velocity)
+            mover = _later(mover, dt)
     return people
 
 
@@ -107,7 +107,7 @@ def _one_step(people: People, near, mover: Mover | None, dt: float) -> People:
     speed = jnp.where(ends, jnp.minimum(speed, far / dt), speed) * people.there
     place = people.position + dt * speed[:, None] * way
     if mover is not None:
-        place = _off_mover(people, place, mover, dt)
+        place = place + _short_of_walls(place, _off_mover(people, place, mover, dt), people.position, standing)
     place = jnp.where(scripted, place, _out_of_walls(place, near))
     return moved_to(people, place, dt, way)
 
@@ -226,23 +226,42 @@ def _room_to_mover(people: People, way: jax.Array, mover: Mover) -> jax.Array:
 
 
 def _off_mover(people: People, place: jax.Array, mover: Mover, dt: float) -> jax.Array:
-    """(N, 2) places of those who yield, a step off the vehicle where it is nearer after `dt` than their berth."""
-    c, s = jnp.cos(dt * mover.yaw_rate), jnp.sin(dt * mover.yaw_rate)
-    axis = jnp.stack([c * mover.axis[0] - s * mover.axis[1], s * mover.axis[0] + c * mover.axis[1]])
-    later = mover._replace(centre=mover.centre + dt * mover.velocity, axis=axis)
-    away = place - _nearest_on(later, place)
+    """(N, 2) m: a step off the vehicle for those who yield, from a place that is nearer after `dt` than their berth."""
+    away = place - _nearest_on(_later(mover, dt), place)
     lacking = jnp.maximum(_berth(people) - _length(away), 0.0)
     off = jnp.minimum(lacking, dt * people.speed) * (people.yields & people.there)
-    return place + off[:, None] * _unit(away, jnp.zeros(away.shape))
+    return off[:, None] * _unit(away, jnp.zeros(away.shape))
 
 
 def stepped_back(people: People, near, mover: Mover, time: jax.Array) -> jax.Array:
-    """(N, 2) m by which people step straight off the vehicle in a time (N,) [s]; 0 where a wall is behind."""
+    """(N, 2) m by which people step straight off the vehicle in a time (N,) [s], as far as walls behind them let."""
     away = people.position - _nearest_on(mover, people.position)
     step = (time * people.speed)[:, None] * _unit(away, jnp.zeros(away.shape))
-    behind = near(people.position + step)
-    narrow = (behind.mask & (_length(people.position[:, None] + step[:, None] - behind.point) < RADIUS)).any(-1)
-    return jnp.where(narrow[:, None], 0.0, step)
+    return _short_of_walls(people.position, step, people.position, near(people.position))
+
+
+def _short_of_walls(place: jax.Array, step: jax.Array, seen_from: jax.Array, near: Near) -> jax.Array:
+    """(N, 2) m: what of a step from a place leads no nearer to walls than the radius of a person, if it was farther.
+
+    A thin wall has no inside from which a person could be pushed back, so nobody may come to its other side. Whatever
+    stands is convex: it lies behind the line through its nearest point `near`, square to the way to `seen_from`.
+    """
+    away = seen_from[:, None] - near.point
+    normal = away / _length(away)[..., None]
+    free = jnp.maximum(_dot(place[:, None] - near.point, normal) - RADIUS, 0.0)
+    for _ in range(2):
+        into = jnp.where(near.mask, -_dot(step[:, None], normal) - free, 0.0)  # (N, M) m
+        worst = jnp.argmax(into, -1)[:, None]
+        outward = jnp.take_along_axis(normal, worst[..., None], 1)[:, 0]
+        step = step + jnp.maximum(jnp.take_along_axis(into, worst, 1), 0.0) * outward
+    return step
+
+
+def _later(mover: Mover, time: float) -> Mover:
+    """The vehicle after a time [s] in which it moves on evenly."""
+    c, s = jnp.cos(time * mover.yaw_rate), jnp.sin(time * mover.yaw_rate)
+    axis = jnp.stack([c * mover.axis[0] - s * mover.axis[1], s * mover.axis[0] + c * mover.axis[1]])
+    return mover._replace(centre=mover.centre + time * mover.velocity, axis=axis)
 
 
 def _berth(people: People) -> jax.Array:
