@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -16,8 +18,12 @@ import numpy as np
 
 from whill_mjx.io.folders import check_file, note_written, write_whole
 from whill_mjx.vehicle.vehicle_file import load_vehicle
-from whill_mjx.world.maps import Reach, make_map_scene, reach_of, read_map, wall_segments
+from whill_mjx.world.maps import MapScene, Reach, make_map_scene, reach_of, read_map, wall_segments
+from whill_mjx.world.maps.nav2 import as_nav2
 from whill_mjx.world.maps.picture import from_above
+
+NAV2 = (".yaml", ".yml")
+"""Endings of nav2 maps."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,8 @@ class Import:
     """nav2 map (.yaml), OpenStreetMap (.osm), CityGML (.gml), point cloud (.ply, .pcd, .npy) or mesh of a building
     (.stl, .glb, .gltf, .obj, .ply)."""
     out: Path = Path("scene")
-    """Name of what is written: OUT.png, the map from above, and OUT.npz, its walls, starts and goals."""
+    """Name of what is written: OUT.png, the map from above, and OUT.npz, its walls, starts and goals; of all but a nav2
+    map also OUT.yaml and OUT.pgm, a nav2 map that tasks read."""
     cell: Annotated[float, Range(0.02, 1.0)] = 0.1
     """Edge of a cell of footprints, point clouds and meshes [m]."""
     scale: Annotated[float, Range(1e-6, 1e3)] = 1.0
@@ -43,10 +50,11 @@ class Import:
 
 
 def main(options: Import) -> None:
-    """Write picture and scene, and print what was found."""
-    picture, arrays = (Path(f"{options.out}{ending}") for ending in (".png", ".npz"))
+    """Write picture, scene and map, and print what was found."""
+    endings = (".png", ".npz") if options.file.suffix.lower() in NAV2 else (".png", ".npz", ".pgm", ".yaml")
+    outs = [Path(f"{options.out}{ending}") for ending in endings]
     with refusing():
-        for path in (picture, arrays):
+        for path in outs:
             check_file("--out", path)
         name, reach = _needed(options)
         grid = read_map(options.file, options.cell, options.scale)
@@ -65,16 +73,22 @@ def main(options: Import) -> None:
         print(note)
     print(f"walls: {len(made.walls.segments)} straight ones, from {steps} edges of cells")
     print(f"starts and goals: {len(places.way)} pairs, {places.way.min():.1f} to {places.way.max():.1f} m apart")
-    import io
+    _write(made, outs, options.pixels)
+    print(", ".join(map(str, outs)))
 
-    buffer = io.BytesIO()
+
+def _write(made: MapScene, outs: Sequence[Path], pixels: int) -> None:
+    """Write the picture, the arrays and, where two more files are named, the image and the YAML file of a nav2 map."""
+    buffer, places, grid = io.BytesIO(), made.places, made.grid
     np.savez_compressed(buffer, walls=made.walls.segments, start=places.start, goal=places.goal, way=places.way,
-                        shift=grid.shift)
-    write_whole(arrays, buffer.getvalue())
-    note_written(arrays)
-    write_whole(picture, from_above(made, options.pixels))
-    note_written(picture)
-    print(f"{picture}, {arrays}")
+                        shift=grid.shift)  # fmt: skip
+    contents: list[str | bytes] = [from_above(made, pixels), buffer.getvalue()]
+    if len(outs) > len(contents):
+        text, image = as_nav2(grid, outs[2].name)
+        contents += [image, text]
+    for path, content in zip(outs, contents, strict=True):
+        write_whole(path, content)
+        note_written(path)
 
 
 def _needed(options: Import) -> tuple[str, Reach]:

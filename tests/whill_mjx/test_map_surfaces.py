@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
-from whill_mjx.world.maps import FREE, OCCUPIED, read_map, surfaces
+from whill_mjx.maps import Import, main
+from whill_mjx.tasks.map_goal import MapGoal
+from whill_mjx.world.maps import FREE, OCCUPIED, UNKNOWN, read_map, surfaces
 from whill_mjx.world.maps.surfaces import _lzf
 
 pytestmark = pytest.mark.quick
@@ -118,10 +123,18 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path, name, content, message)
     assert name in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_millimetres_taken_for_metres_are_refused_with_the_remedy(tmp_path):
-    np.save(tmp_path / "room.npy", 1000.0 * cloud_of_a_room())
-    with pytest.raises(ValueError, match="--scale"):
-        read_map(tmp_path / "room.npy")
+def test_millimetres_taken_for_metres_are_refused_with_a_remedy_that_works(tmp_path):
+    np.save(tmp_path / "room.npy", 1000.0 * cloud_of_a_room() * np.array([2.0, 2.0, 1.0]))
+    with pytest.raises(ValueError, match="--scale") as refused:
+        MapGoal(map=str(tmp_path / "room.npy")).checksum()
+    words = re.search(r"run python -m whill_mjx.maps (\S+) --scale (\S+) --out NAME", str(refused.value)).groups()
+    main(Import(Path(words[0]), tmp_path / "a: #1", scale=float(words[1]), pixels=100))
+    direct, converted = read_map(words[0], scale=0.001), read_map(tmp_path / "a: #1.yaml")
+    np.testing.assert_array_equal(converted.cells, direct.cells)
+    assert (converted.resolution, converted.origin) == (direct.resolution, direct.origin)
+    assert set(np.unique(direct.cells)) == {FREE, UNKNOWN, OCCUPIED}
+    task = MapGoal(map=str(tmp_path / "a: #1.yaml"))
+    assert task.checksum() and task.sample_world(jax.random.key(0)).scene.walls.segments.shape[0] > 4
 
 
 def test_the_command_imports_a_cloud(tmp_path):

@@ -1,10 +1,11 @@
-"""Reader of nav2 maps: a YAML file and the image that it names, as cells by the rule of nav2_map_server.
+"""nav2 maps: a YAML file and the image that it names, read as cells by the rule of nav2_map_server, and written.
 
 The rule is that of `nav2_map_server` (map_io) since it compares with `>=` and `<=`: see docs/maps.md.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -19,6 +20,8 @@ from whill_mjx.world.maps.images import read_levels
 
 YAML_BYTES = MB // 100  # a map file has 0.2 kB
 REAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+LEVELS = np.array([254, 128, 0], np.uint8)
+"""Grey levels that stand for FREE, UNKNOWN and OCCUPIED where a map is written."""
 TRUE, FALSE = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
 
 
@@ -45,6 +48,15 @@ def load_map(path: str | Path) -> GridMap:
     x, y, yaw = table["origin"]
     occupancy = occupancy[::-1].copy()  # the last row of the image lies at the bottom
     return GridMap(kinds[occupancy], table["resolution"], (x, y, yaw), occupancy).brought_near()
+
+
+def as_nav2(grid: GridMap, image: str) -> tuple[str, bytes]:
+    """YAML text of a map whose image has the name `image`, and that image as PGM; read, both give the same cells."""
+    x, y, yaw = (float(one) for one in grid.origin)
+    text = (f"image: {json.dumps(image)}\nmode: trinary\nresolution: {float(grid.resolution)!r}\n"
+            f"origin: [{x!r}, {y!r}, {yaw!r}]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n")  # fmt: skip
+    rows, columns = grid.cells.shape
+    return text, f"P5\n{columns} {rows}\n255\n".encode() + LEVELS[grid.cells[::-1]].tobytes()
 
 
 def level_occupancy(mode: str, occupied: float, free: float, negate: bool) -> np.ndarray:

@@ -29,6 +29,9 @@ HOLE = 0.5
 """Gaps of the floor that are closed: lines of a scanner lie so far apart [m]."""
 MARGIN = 0.5
 """Around everything [m]."""
+CONVERT = ("If it is not in metres, run python -m whill_mjx.maps {} --scale 0.001 --out NAME (0.001 for millimetres) "
+           "and take NAME.yaml as the map.")
+"""What to do about a file in another unit. Tasks read metres; the command writes a map that they read."""
 TYPES = {("F", 4): "f4", ("F", 8): "f8", ("U", 1): "u1", ("U", 2): "u2", ("U", 4): "u4", ("I", 1): "i1", ("I", 2): "i2",
          ("I", 4): "i4", ("U", 8): "u8", ("I", 8): "i8"}  # fmt: skip
 
@@ -66,8 +69,8 @@ def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0)
     low, high = points[:, :2].min(0) - MARGIN, points[:, :2].max(0) + MARGIN
     size = high - low
     if len(points) > MOST_POINTS or np.prod(np.ceil(size / resolution)) > MAX_CELLS:
-        raise ValueError(f"{path}: spans {size[0]:.0f} x {size[1]:.0f} m. Correct --scale (metres per unit), or take "
-                         "larger cells (--cell).")
+        raise ValueError(f"{path}: spans {size[0]:.0f} x {size[1]:.0f} m. {CONVERT.format(path)} Where it "
+                         "is in metres, --cell takes larger cells in the same way.")
     columns, rows = np.ceil(size / resolution).astype(int)
     if faces is None:
         floor, solid = _of_cloud(points, low, (rows, columns), resolution)
@@ -75,7 +78,7 @@ def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0)
         floor, solid = _of_mesh(points, faces, low, (rows, columns), resolution)
     if not (floor & ~solid).any():
         raise ValueError(f"{path}: has no level floor within {size[0]:.1f} x {size[1]:.1f} m. Turn it so that z points "
-                         "up, and check --scale (metres per unit).")
+                         f"up. {CONVERT.format(path)}")
     cells = np.full((rows, columns), UNKNOWN, np.uint8)
     cells[floor] = FREE
     cells[solid] = OCCUPIED
