@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -14,15 +15,17 @@ import pytest
 
 from whill_mjx import maps
 from whill_mjx.env import make_env, observe, reset_state, step_state
+from whill_mjx.env.moments import view_of
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.learning.identity import identity_of
 from whill_mjx.learning.setup import find_preset
+from whill_mjx.sensors.depth import Depth
 from whill_mjx.tasks.base import Task
 from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.map_goal import MapGoal
 from whill_mjx.tasks.parts import make_marker
 from whill_mjx.vehicle.kinematics import reference_pose
-from whill_mjx.vehicle.specs import WARTHOG, WHILL_CR
+from whill_mjx.vehicle.specs import SPECS, WARTHOG, WHILL_CR, CameraMount
 from whill_mjx.world.collision import free_distance, obstacles_of, touches
 from whill_mjx.world.maps import (
     FREE,
@@ -44,7 +47,7 @@ from whill_mjx.world.maps import walls as map_wall_module
 from whill_mjx.world.maps.places import farthest_move
 from whill_mjx.world.maps.several import GAP, side_by_side
 from whill_mjx.world.maps.straight import open_space, outline, straight_walls
-from whill_mjx.world.maps.walls import map_walls, most_seen, wall_boxes
+from whill_mjx.world.maps.walls import map_walls, most_seen, sees_behind, wall_boxes
 from whill_mjx.world.maps.ways import SPACING, draw_ways
 from whill_mjx.world.render import camera_rotation, pinhole, render_frame
 from whill_mjx.world.scene import Scene, default_looks, footprint, no_boxes, stack_boxes
@@ -217,6 +220,61 @@ def test_a_camera_that_looks_down_sees_the_walls_beside_its_horizon(pitch):
         right = render_frame(position, rotation, lens, dataclasses.replace(scene, boxes=every, walls=None)).depth
         assert (np.abs(seen - right) > 0.05).mean() < 0.005
         assert float(right[-1, 0]) < 1.0  # the pillar
+
+
+LOOKS_DOWN = CameraMount(x=0.0, z=0.9, pitch=1.4, fov_y=1.6)
+AROUND = 0.35 * np.stack([np.cos(np.arange(5.0)), np.sin(np.arange(5.0))], -1)  # middles of pillars
+
+
+def pillared():
+    """A room around zero with pillars near zero on all sides, of which an image shows what the camera sees, and all."""
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    rings = [5.0 * corners, *(middle + 0.06 * corners[::-1] for middle in AROUND)]
+    walls = map_walls(np.concatenate([np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings]), keep=24)
+    scene = Scene(no_boxes(24), make_marker(50.0, 0.0, 0.1, 0.1), default_looks(), walls=walls)
+    every = wall_boxes(jnp.asarray(walls.segments), jnp.arange(24), jnp.ones(24, bool), 2.2, scene.boxes.colour[0])
+    return scene, dataclasses.replace(scene, boxes=every, walls=None)
+
+
+@pytest.mark.parametrize("pitch", [1.2, 1.4, np.pi / 2, -1.2])
+@pytest.mark.parametrize("roll", [0.0, 0.7])
+def test_a_camera_that_looks_steeply_sees_the_walls_behind_it(pitch, roll):
+    scene, every = pillared()
+    mount = dataclasses.replace(LOOKS_DOWN, pitch=pitch, roll=roll)
+    lens, eye = pinhole(mount.fov_y, 48, 48), (jnp.array([0.0, 0.0, 0.9]), camera_rotation(0.3, pitch, roll))
+
+    @partial(jax.jit, static_argnums=0)
+    def wrong(mount):
+        seen, right = (render_frame(*eye, lens, one).depth for one in (shown(scene, *eye, lens, mount), every))
+        return jnp.mean((jnp.abs(seen - right) > 0.05) | (jnp.isfinite(seen) != jnp.isfinite(right)))
+
+    assert float(wrong(mount)) < 0.005 < float(wrong(None))
+
+
+def test_only_cameras_that_look_steeply_see_what_is_behind_them():
+    assert not any(sees_behind(spec.camera, 64, 64) for spec in SPECS.values())
+    level = CameraMount(pitch=0.8, fov_y=1.2)
+    assert not sees_behind(level, 64, 64) and not sees_behind(dataclasses.replace(level, pitch=-0.8), 64, 64)
+    tall = dataclasses.replace(level, roll=np.pi / 2)  # on its side, the image's width lies along the pitch
+    assert sees_behind(tall, 64, 128) and not sees_behind(tall, 64, 64)
+
+
+def test_the_images_of_a_vehicle_show_what_is_behind_a_camera_that_looks_down():
+    scene, every = pillared()
+    env, params = make_env("point_goal", observations={"depth": Depth(32, 32)}, height=32, width=32)
+    camera = dataclasses.replace(LOOKS_DOWN, x=env.model.spec.reference_x)  # above zero, where the vehicle starts
+    spec = dataclasses.replace(env.model.spec, camera=camera)
+    env = dataclasses.replace(env, model=dataclasses.replace(env.model, spec=spec))
+    start = dataclasses.replace(jax.jit(lambda key: reset_state(env, params, key))(jax.random.key(0)), trail=None)
+
+    @jax.jit
+    def images(scene):
+        state = dataclasses.replace(start, scene=scene)
+        depth = env.sensors[0][1].measure((), view_of(env, params, state), jax.random.key(0))[1]
+        return observe(env, state).astype(float).mean(-1), depth
+
+    for seen, right in zip(images(scene), images(every), strict=True):
+        assert float(jnp.mean(jnp.abs(seen - right) > 0.05)) < 0.005
 
 
 def test_starts_and_goals_are_free_and_a_way_apart():

@@ -28,8 +28,9 @@ def observe(env: Env, state: State) -> jax.Array:
     if env.rich:
         return _observe_rich(env, state)
     position, rotation = camera_pose(env.model, state.vehicle.qpos)
-    intrinsics = pinhole(env.model.spec.camera.fov_y, env.height, env.width)
-    scene = shown(state.scene, position, rotation, intrinsics)
+    mount = env.model.spec.camera
+    intrinsics = pinhole(mount.fov_y, env.height, env.width)
+    scene = shown(state.scene, position, rotation, intrinsics, mount)
     image = draw(position, rotation, intrinsics, scene)
     if not env.photometric:
         return image
@@ -42,15 +43,15 @@ def _observe_rich(env: Env, state: State) -> jax.Array:
     assert trail is not None
     position, rotation = camera_pose(env.model, trail[eye.delay])
     position, rotation = mounted(eye, position, rotation)
-    fov = env.model.spec.camera.fov_y * eye.zoom
-    intrinsics = pinhole(fov, env.height, env.width)
+    mount = env.model.spec.camera
+    intrinsics = pinhole(mount.fov_y * eye.zoom, env.height, env.width)
 
     then, before = camera_pose(env.model, trail[-1])
     ahead = before[:2, 2] * jax.lax.rsqrt(jnp.sum(before[:2, 2] ** 2) + 1e-6)
     metered = [jnp.log(floor_light(lights, *(then[:2] + far * ahead)) + 1e-4) for far in METERED]
     exposure = 0.5 * jnp.exp(-sum(metered) / len(METERED))
     rich = dataclasses.replace(state.scene.rich, lights=dataclasses.replace(lights, exposure=exposure))
-    scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics)
+    scene = shown(dataclasses.replace(state.scene, rich=rich), position, rotation, intrinsics, mount)
     image = draw(position, rotation, intrinsics, scene, RICH)
     turning = state.vehicle.qvel[5] * SHUTTER * intrinsics.fx
     return develop(image, eye, turning, jax.random.fold_in(state.key, state.step_count), state.step_count)

@@ -45,8 +45,9 @@ class Depth(Sensor):
     def measure(self, memory: Any, view: View, key: jax.Array) -> tuple[Any, jax.Array]:
         env, state = view.env, view.state
         position, rotation = camera_pose(env.model, state.vehicle.qpos)
-        intrinsics = pinhole(env.model.spec.camera.fov_y, *self.size(env))
-        scene = shown(state.scene, position, rotation, intrinsics)
+        mount = env.model.spec.camera
+        intrinsics = pinhole(mount.fov_y, *self.size(env))
+        scene = shown(state.scene, position, rotation, intrinsics, mount)
         depth = render_frame(position, rotation, intrinsics, scene).depth
         depth = jnp.clip(depth, 0.0, self.reach)
         if not self.as_bytes:

@@ -7,11 +7,13 @@ as high as the camera looks.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from whill_mjx.vehicle.specs import CameraMount
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.scene import WALL, Boxes, MapWalls, Scene
 
@@ -172,6 +174,21 @@ def distances_to(segments: jax.Array, x, y) -> jax.Array:
     return jnp.hypot(start[:, 0] + share * way[:, 0] - x, start[:, 1] + share * way[:, 1] - y)
 
 
+def sees_behind(mount: CameraMount, height: int, width: int) -> bool:
+    """Whether an image of this size shows what lies behind the place of a camera whose vehicle stands level.
+
+    It does where the ray of its lowest or highest corner leans beyond the vertical.
+    """
+    reach = math.tan(mount.fov_y / 2) * (abs(math.cos(mount.roll)) + width / height * abs(math.sin(mount.roll)))
+    return abs(math.sin(mount.pitch)) * reach > abs(math.cos(mount.pitch))
+
+
+def all_around(heading: jax.Array, width: int) -> jax.Array:
+    """(3, width) rad: bearings of thirds of a full turn, evenly spaced; the heading is in the middle of the first."""
+    share = (jnp.arange(width) + 0.5) / width - 0.5
+    return heading + 2 * jnp.pi / 3 * (jnp.array([0.0, 1.0, -1.0])[:, None] + share)
+
+
 def bearings(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
     """(width + 2 BESIDE,) rad: bearings in the world of all that an image shows, without lens distortion.
 
@@ -226,17 +243,24 @@ def horizon_angles(rotation: jax.Array, intrinsics: Intrinsics) -> jax.Array:
     return jnp.arctan2(y, x)
 
 
-def shown(scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: Intrinsics) -> Scene:
+def shown(
+    scene: Scene, position: jax.Array, rotation: jax.Array, intrinsics: Intrinsics, mount: CameraMount | None = None
+) -> Scene:
     """The scene with the walls of its map that this camera sees, in place of its last `keep` boxes.
 
     As many rays as the image has columns, along its horizon, and a few beyond it on both sides find the nearest walls.
-    A scene without a map stays as it is.
+    Where the mount lets it look so steeply down or up that it sees what is behind it, rays all around are added.
+    Without a mount there are none. A scene without a map stays as it is.
     """
     walls = scene.walls
     if walls is None:
         return scene
     segments = jnp.asarray(walls.segments)
-    index = first_walls(segments, position[0], position[1], bearings(rotation, intrinsics))
+    fans = [bearings(rotation, intrinsics)]  # less than half a turn each
+    if mount is not None and sees_behind(mount, intrinsics.height, intrinsics.width):
+        c, s = _heading(rotation)
+        fans += [*all_around(jnp.arctan2(s, c), intrinsics.width)]
+    index = jnp.concatenate([first_walls(segments, position[0], position[1], fan) for fan in fans])
     index, mask = most_seen(index, walls.keep)
     fixed = scene.boxes.mask.shape[0] - walls.keep
     drawn = wall_boxes(segments, index, mask, walls.height, scene.boxes.colour[fixed])
