@@ -8,8 +8,10 @@ import queue
 import re
 import shutil
 import socket
+import struct
 import subprocess
 import threading
+import time
 import urllib.error
 import urllib.request
 from html.parser import HTMLParser
@@ -238,6 +240,19 @@ def test_a_live_page_serves_reports_without_scripts_and_nothing_else(served):
             get(address + wrong)
     with pytest.raises(urllib.error.HTTPError, match="403"):
         get(address, Host="evil.example:80")
+
+
+def test_a_browser_that_goes_before_it_has_its_answer_leaves_no_traceback(served, capfd):
+    folder, address = served
+    (folder / "film.mp4").write_bytes(bytes(20_000_000))
+    get(address)  # the page is made
+    host, port = address.split("/")[2].split(":")
+    with socket.create_connection((host, int(port))) as browser:
+        browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it closes by a reset
+        browser.sendall(f"GET /run/0/film.mp4 HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode())
+        browser.recv(1000)
+    time.sleep(0.5)
+    assert get(f"{address}version")[0] and "Traceback" not in capfd.readouterr().err
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

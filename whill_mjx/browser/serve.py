@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import sys
 import threading
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -84,7 +85,15 @@ class Site:
 
 def make_server(site: Site, port: int) -> ThreadingHTTPServer:
     """A server of a site on the loopback; port 0 takes a free one. OSError where the port is taken."""
-    return ThreadingHTTPServer((HOST, port), _handler(site))
+    return _Server((HOST, port), _handler(site))
+
+
+class _Server(ThreadingHTTPServer):
+    """Goes on in silence where a browser has gone before it had its answer."""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
 
 
 def _handler(site: Site) -> type[BaseHTTPRequestHandler]:
@@ -98,8 +107,8 @@ def _handler(site: Site) -> type[BaseHTTPRequestHandler]:
             address = self.path.partition("?")[0].lstrip("/")
             try:
                 self._serve(address)
-            except (FileNotFoundError, ValueError) as error:
-                self._answer(503, str(error).encode(), "text/plain; charset=utf-8")
+            except (OSError, ValueError) as error:
+                self._answer(503, str(error).encode("utf-8", "replace"), "text/plain; charset=utf-8")
 
         def _serve(self, address: str) -> None:
             if address == "":
