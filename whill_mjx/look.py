@@ -202,13 +202,13 @@ def depth_picture(depth: np.ndarray) -> np.ndarray:
     return np.repeat(grey[..., None], 3, -1).astype(np.uint8)
 
 
-def film_of(options: Look) -> list[np.ndarray]:
-    """Frames of the video of a scene, at the size of its camera image."""
+def film_of(options: Look) -> tuple[list[np.ndarray], float]:
+    """Frames of the video of a scene, at the size of its camera image, and how many there are in a second."""
     if options.scene == "gallery":
         scene, lens, best = gallery(), pinhole(1.0, 144, 192), Quality(antialias=True, shadows=True)
         # The scene is an argument: as a constant, XLA would work it out while compiling.
         draw = jax.jit(lambda share, scene: render(*walk(share), lens, scene, best))
-        return [np.asarray(draw(share, scene)) for share in jnp.linspace(0.0, 1.0, 60)]
+        return [np.asarray(draw(share, scene)) for share in jnp.linspace(0.0, 1.0, 60)], 10.0
     env, params = _env(options)
     config, state, plan, plan_key = _start(options, env, params)
 
@@ -222,11 +222,11 @@ def film_of(options: Look) -> list[np.ndarray]:
         frames.append(np.asarray(image))
         if bool(state.done):
             break
-    return frames
+    return frames, 1.0 / (env.model.config.control_dt * env.task.action_repeat)
 
 
-def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: int = 10) -> None:
-    """Write frames (H, W, 3) uint8 as a video, whole or not at all."""
+def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: float) -> None:
+    """Write frames (H, W, 3) uint8 as a video of `rate` frames per second, whole or not at all."""
     large = [frame.repeat(scale, 0).repeat(scale, 1) for frame in frames]
     if path.suffix != ".gif":
         write_h264(path, large, rate)
@@ -332,8 +332,8 @@ def _draw(options: Look) -> None:
         print(f"{options.out if options.out.suffix == RECORDING else 'viewer'}: {steps} steps of {options.scene}")
         return
     if options.out.suffix in VIDEOS:
-        frames = film_of(options)
-        write_video(options.out, frames, options.scale)
+        frames, rate = film_of(options)
+        write_video(options.out, frames, options.scale, rate)
         print(f"{options.out}: {len(frames)} frames of {options.scene}")
         return
     seen = None if options.scene == "gallery" else _env(options)

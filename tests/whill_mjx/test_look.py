@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
+from whill_mjx import look
 from whill_mjx.env import make_env, reset_state
 from whill_mjx.look import Look, _missing, depth_picture, main, top_view, write_png
 from whill_mjx.tasks.tasks import TASKS
@@ -64,3 +66,12 @@ def test_the_view_from_above_follows_a_vehicle_that_would_leave_it():
 
     for x, y in ((0.0, 0.0), (-3.0, 0.0), (0.0, 3.3), (1.0, -3.3)):
         assert (np.asarray(view(x, y)).max(-1) < 40).sum() >= 3  # its dark box
+
+
+def test_a_video_lasts_as_long_as_the_drive_whatever_a_step_holds(tmp_path, monkeypatch):
+    monkeypatch.setattr(look, "first_plan", lambda *_: jnp.zeros(1))
+    monkeypatch.setattr(look, "plan_action", lambda config, env, state, plan, key: (jnp.zeros(2), plan))
+    monkeypatch.setattr(look, "observe", lambda env, state: jnp.full((8, 8, 3), state.step_count).astype(jnp.uint8))
+    main(Look(scene="point_goal", out=tmp_path / "a.gif", set=("action_repeat=4", "max_steps=12")))
+    with Image.open(tmp_path / "a.gif") as film:
+        assert film.n_frames == 3 and film.info["duration"] == 400  # 12 control periods of 0.1 s [ms]
