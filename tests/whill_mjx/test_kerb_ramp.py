@@ -73,3 +73,11 @@ def test_worlds_of_the_kerb_vary_and_leave_a_way_through():
                    for index, side in ((3, 1.0), (4, -1.0)))  # fmt: skip
     width = np.asarray(left - right)
     assert width.min() >= task.cut[0] - 1e-5 and width.max() <= task.cut[1] + 1e-5
+
+
+@pytest.mark.quick
+def test_a_ramp_that_leads_through_the_wall_behind_the_marker_is_refused():
+    KerbRamp(rise=(0.06, 0.14), run=(8.0, 30.0))  # it ends at 6.4 m, the room at 7.5 m
+    for fields in ({"rise": (0.1, 0.5)}, {"run": (8.0, 40.0)}, {"kerb_x": 6.0}, {"goal_x": 1.5}):
+        with pytest.raises(ValueError, match="the ramp ends at .* and the room at .* farther goal_x"):
+            KerbRamp(**fields)

@@ -23,6 +23,8 @@ SLABS = 6
 """Flat pieces that show the ramp."""
 HALF = 2.0
 """Half the distance of the walls [m]."""
+BEHIND = 2.0
+"""From the marker to the wall behind it [m]."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,14 @@ class KerbRamp(Task):
     run: tuple[float, float] = (8.0, 12.0)
     """Least and largest length of the ramp for its height."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        longest, end_x = max(self.rise) * max(self.run), self.goal_x + BEHIND
+        if self.kerb_x + longest >= end_x:
+            raise ValueError(f"task: kerb_x {self.kerb_x:g}, rise {max(self.rise):g}, run {max(self.run):g}: the ramp "
+                             f"ends at {self.kerb_x + longest:g} m, and the room at {end_x:g} m. Take a lower rise, a "
+                             "shorter run or a nearer kerb_x, or a farther goal_x.")  # fmt: skip
+
     def sample_world(self, key: jax.Array) -> World:
         """Place, width, height and steepness of the cut, the goal behind it, place and heading of the start."""
         draw = self.draws(key)
@@ -67,7 +77,7 @@ class KerbRamp(Task):
             jnp.zeros(()), start_y, jnp.arctan2(cut_y - start_y, self.kerb_x) + draw(-0.3, 0.3, fixed=0.0)
         ])
         ramp = Ramp(rise=rise, length=rise * run, distance=jnp.asarray(self.kerb_x), direction=jnp.zeros(()))
-        end_x = self.goal_x + 2.0
+        end_x = self.goal_x + BEHIND
         boxes = stack_boxes([*lane(jnp.asarray(HALF), end_x), *_stones(ramp, cut_y, width)])
         marker = make_marker(self.goal_x, goal_y, size=0.6, height=0.8 + rise)
         scene = Scene(
