@@ -43,6 +43,8 @@ SCRIPTED = ("planner", "random")
 NAME = re.compile("[A-Za-z0-9_-]{1,60}")
 KIND = "whill_mjx.evaluate"
 OUTPUTS = ("report.html", "paths.png", "failures.png", "failures.mp4")
+OF_OPTIONS = ("paths_*.png", "sweep_*.png")
+"""Pictures whose names depend on the options."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +184,7 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
             "drivers": summaries,
             "sweeps": [result.plain() for result in results],
         }
+        remove_earlier(options.out)
         write_json(options.out / "evaluation.json", evaluation, allow_nan=False)  # kept, whatever becomes of pictures
         stage("drawing pictures and videos")
         pictures, videos = draw(options, task, course(), driven, main_name, results)
@@ -195,6 +198,13 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
     say(f"wrote {files} in {options.out}; {evaluation['seconds']:.0f} s"
         + ("" if options.html else ". With --html you get one page with everything."))
     return evaluation
+
+
+def remove_earlier(out: Path) -> None:
+    """Remove page, pictures and video of an earlier evaluation: beside the new figures they would pass for its own."""
+    for pattern in (*OUTPUTS, *OF_OPTIONS):
+        for path in out.glob(pattern):
+            path.unlink(missing_ok=True)
 
 
 def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
@@ -297,8 +307,9 @@ def draw(
             )
     if len(failed):
         jobs["failures.png"] = lambda path: pages.paths_from_above(episodes.some(failed), radius, path)
-    for sweep in sweeps:
+    for number, sweep in enumerate(sweeps, start=1):
         label = "_".join(axis.name for axis in sweep.axes)
+        label += f"_{number}" if f"sweep_{label}.png" in jobs else ""
         jobs[f"sweep_{label}.png"] = lambda path, sweep=sweep: pages.sweep_picture(sweep, path, main_name)
         if any(axis.name in ("obstacle_x", "obstacle_y") for axis in sweep.axes):
             jobs[f"paths_{label}.png"] = lambda path, sweep=sweep: pages.sweep_paths(sweep, path, radius)

@@ -16,7 +16,7 @@ import pytest
 
 from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
-from whill_mjx.evaluate import EvaluateOptions, choose_task, main
+from whill_mjx.evaluate import EvaluateOptions, choose_task, draw, main
 from whill_mjx.evaluation import pages
 from whill_mjx.evaluation.conditions import nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
@@ -26,7 +26,7 @@ from whill_mjx.evaluation.onnx_network import Network
 from whill_mjx.evaluation.pages import episode_video
 from whill_mjx.evaluation.policy_file import load_policy
 from whill_mjx.evaluation.rollouts import CHANNELS, View, rollout
-from whill_mjx.evaluation.sweeps import parse_sweep, with_parameter
+from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, with_parameter
 from whill_mjx.io.html import STYLE
 from whill_mjx.io.video import write_h264
 from whill_mjx.tasks.tasks import make_task
@@ -273,6 +273,35 @@ def test_an_ending_of_the_tasks_own_is_shown_by_its_name():
     assert [pages.ending(episodes, index) for index in range(2)] == ["lost_sight", "success"]
     table = pages._figures({"policy": summarise(episodes)})
     assert re.search(r"lost sight.{0,40}50\W*%", table)
+
+
+def test_an_evaluation_replaces_page_pictures_and_video_of_an_earlier_one(tmp_path):
+    stale = ("report.html", "failures.mp4", "sweep_light.png", "paths_planner.png")
+    options = EvaluateOptions("random", "point_goal", episodes=1, out=tmp_path / "out", set=("max_steps=2",), videos=0)
+    main(options)
+    for name in stale:
+        (options.out / name).write_text("of an earlier evaluation")
+    (options.out / "notes.txt").write_text("somebody's own")
+    main(options)
+    left = {path.name for path in options.out.iterdir()}
+    assert not left & set(stale) and {"evaluation.json", "paths.png", "failures.png", "notes.txt"} <= left
+
+
+@pytest.mark.quick
+def test_two_grids_over_the_same_thing_have_a_picture_each(tmp_path, monkeypatch):
+    monkeypatch.setattr(pages, "paths_from_above", lambda *_, **__: None)
+    monkeypatch.setattr(pages, "sweep_picture", lambda sweep, path, name: path.write_text(str(sweep.axes[0].values)))
+    sweeps = [Sweep((Axis("light", values),), 1, {}, {}, []) for values in ((0.5, 1.0), (1.0, 1.5), (1.5, 2.0))]
+    options, driven = EvaluateOptions("planner", out=tmp_path), {"planner": made_up([[1.0] * 3], [("success", 0.1)])}
+    pictures, _ = draw(options, make_task("point_goal"), None, driven, "planner", sweeps)
+    assert [path.read_text() for path in pictures[1:]] == [str(sweep.axes[0].values) for sweep in sweeps]
+
+
+@pytest.mark.quick
+def test_a_mean_of_one_value_has_no_interval():
+    one, two = made_up([[1.0] * 3], [("success", 0.1)]), made_up([[1.0] * 3] * 2, [("success", 0.1), ("timeout", 0.2)])
+    assert summarise(one)["return_interval_95"] is None and summarise(one)["success_interval_95"][0] < 0.5
+    assert summarise(two)["return_interval_95"] and summarise(two)["time_to_goal_s_interval_95"] is None
 
 
 @pytest.mark.quick

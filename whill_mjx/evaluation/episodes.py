@@ -218,7 +218,10 @@ def episode_figures(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, np.
 
 
 def summarise(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, Any]:
-    """Figures of a set of episodes, each with its 95 % interval: Wilson's for shares, the bootstrap for means."""
+    """Figures of a set of episodes, each with its 95 % interval: Wilson's for shares, the bootstrap for means.
+
+    A mean of one value has none: how far others would lie from it is not known.
+    """
     figures = episode_figures(episodes, near_m)
     summary: dict[str, Any] = {"episodes": episodes.count, "near_m": near_m}
     for name in shares_of(episodes):
@@ -229,7 +232,7 @@ def summarise(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, Any]:
     for name in (*MEANS, *OF_SUCCESSES):
         values = figures[name][np.isfinite(figures[name])]
         summary[name] = _mean(values)
-        summary[f"{name}_interval_95"] = list(bootstrap_interval(values)) if len(values) else None
+        summary[f"{name}_interval_95"] = list(bootstrap_interval(values)) if len(values) > 1 else None
     summary["return_sd"] = float(figures["return"].std())
     summary["episodes_with_near_miss"] = float((figures["near_misses"] > 0).mean())
     nearest = np.sort(figures["min_clearance_m"])
