@@ -73,6 +73,11 @@ class Capsules(NamedTuple):
     last: Ends
 
 
+def _touching(ends: Ends) -> Ends:
+    """Ends (N, TOUCHING, 3) of the capsules that a vehicle can meet."""
+    return ends[0][:, : body.TOUCHING], ends[1][:, : body.TOUCHING]
+
+
 def _distances(capsules: Capsules, vehicle: Footprint, share: jax.Array) -> jax.Array:
     """(N,) m from a vehicle to each person at a share () of the period."""
     start, end = (a + share * (b - a) for a, b in zip(capsules.first, capsules.last, strict=True))
@@ -138,9 +143,7 @@ def walk_around(
     # The barriers keep XLA from computing the walk and the contacts again for each thing that needs them.
     walked = jax.lax.optimization_barrier(walked)
     last = jax.lax.optimization_barrier(body.skeleton(walked))
-    capsules = Capsules(people.height, people.there, *(
-        tuple(ends[:, : body.TOUCHING] for ends in both) for both in (first, last)
-    ))  # fmt: skip
+    capsules = Capsules(people.height, people.there, _touching(first), _touching(last))
     turn = duration * mover.yaw_rate
 
     def vehicle(share):
