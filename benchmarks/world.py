@@ -1,4 +1,4 @@
-"""Maps and contact: wrong pixels of the horizon, and how deep a vehicle gets: `python -m benchmarks.world`.
+"""Maps and contact: wrong pixels of the horizon, depth of contacts, and nav2's rule: `python -m benchmarks.world`.
 
 The real maps are those of ../shared/data/maps.
 """
@@ -6,8 +6,12 @@ The real maps are those of ../shared/data/maps.
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+import xml.etree.ElementTree as xml
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -44,7 +48,7 @@ class Options:
     """Options of the benchmark."""
 
     parts: tuple[str, ...] = ("maps", "contact")
-    """Of maps (wrong pixels) and contact (penetration)."""
+    """Of maps (wrong pixels), contact (penetration) and nav2 (maps against nav2's rule, cell by cell)."""
     maps: Path = Path("../shared/data/maps")
     """Folder of the real maps."""
     poses: int = 1000
@@ -161,7 +165,22 @@ def penetration(options: Options) -> dict[str, Any]:
     return {"penetration_cm": figure([100 * max(depths)], "cm")}
 
 
-PARTS = {"maps": wrong_pixels, "contact": penetration}
+def wrong_maps(options: Options) -> dict[str, Any]:
+    """How many maps have a cell that nav2's rule gives another value: the tests of it, of real and of made maps."""
+    with TemporaryDirectory() as folder:
+        report = Path(folder) / "report.xml"
+        tests = Path(__file__).parent.parent / "tests/whill_mjx/test_maps_nav2.py"
+        subprocess.run([sys.executable, "-m", "pytest", "-q", str(tests), "-k", "has_the_cells_of_nav2",
+                        f"--junit-xml={report}"], cwd=tests.parents[2])
+        [suite] = xml.parse(report).getroot().iter("testsuite")
+    tried = int(suite.attrib["tests"]) - int(suite.attrib["skipped"])
+    wrong = int(suite.attrib["failures"]) + int(suite.attrib["errors"])
+    if int(suite.attrib["skipped"]):
+        raise SystemExit(f"{suite.attrib['skipped']} maps of ../shared/data/maps are not there. Put them there.")
+    return {"nav2_cells_wrong": figure([float(wrong)], f"of {tried} maps, of which a cell is wrong")}
+
+
+PARTS = {"maps": wrong_pixels, "contact": penetration, "nav2": wrong_maps}
 
 
 def main(options: Options) -> None:
