@@ -470,6 +470,17 @@ def test_each_file_with_commands_and_odometry_is_a_drive(tmp_path):
     assert [trial.name for trial in log.trials] == ["circle_1", "circle_2"]
 
 
+def test_a_drive_that_is_there_twice_is_named(tmp_path):
+    c = columns()
+    for name in ("drive", "drive_copy"):
+        write(tmp_path / "logs" / f"{name}.csv", with_units(c))
+    write(tmp_path / "logs" / "other.csv", with_units(columns(CHAIR["circle_1"])))
+    log, notes = convert(ConvertConfig(tmp_path / "logs", tmp_path / "data"))
+    assert len(log.trials) == 3 and [one for one in notes if "is a copy of" in one] == [
+        "drive_copy is a copy of drive: as replicates they would show a noise of 0, and held out it would be seen "
+        "before. Leave one out"]
+
+
 def test_decimal_commas_and_cells_that_are_empty_are_read(tmp_path):
     c = columns()
     path = write(tmp_path / "drive.csv", {"Zeit": c["t"], "v_soll": c["cv"], "w_soll": c["cw"], "v_ist": c["v"],
