@@ -32,17 +32,25 @@ class ChairNode:
         self._message = Odometry
         self._last = math.nan
         self._warned = False
+        self.unusable = 0
+        """States whose angles or speeds were not finite."""
         self._publisher = node.create_publisher(Odometry, ros.ODOMETRY_TOPIC, ros.reliable())
         node.create_subscription(ros.chair_state_type(), options.state_topic, self._on_state, ros.best_effort(10))
 
     def _on_state(self, state: Any) -> None:
-        now = time.monotonic()
-        pose = self.odometry.update(now, ChairState.of(state))
+        now, known = time.monotonic(), ChairState.of(state)
         if now - self._last > SLOW and not self._warned:
             self._warned = True
             self.node.get_logger().warning(f"a state each {now - self._last:.2f} s is too slow to identify a vehicle: "
                                            "start the driver with publish_interval_ms:=20")
         self._last = now
+        if not known.is_finite:
+            self.unusable += 1
+            if self.unusable == 1:
+                self.node.get_logger().warning("a state with an angle or speed that is not finite is left out: check "
+                                               "the chair's driver")
+            return
+        pose = self.odometry.update(now, known)
         message = self._message()
         message.header.stamp = self.node.get_clock().now().to_msg()
         message.header.frame_id, message.child_frame_id = "odom", "base_link"
@@ -73,6 +81,8 @@ def main(arguments: list[str] | None = None) -> int:
         ros.spin(node)
         if chair.odometry.gaps:
             print(f"bridge.chair: {chair.odometry.gaps} gaps above 2 s in which the pose stood still", file=sys.stderr)
+        if chair.unusable:
+            print(f"bridge.chair: {chair.unusable} states that were not finite were left out", file=sys.stderr)
     return Exit.DONE
 
 

@@ -159,6 +159,13 @@ class CommandListener:
         if kind != "auto":
             self._open(kind)
 
+    def know(self, node: str) -> bool:
+        """Take a node of the bridge by its full name, which is no base then; return whether it is a new one."""
+        new = node not in self._known
+        if new:
+            self._known.append(node)
+        return new
+
     def readers(self) -> list[Endpoint]:
         """Return all who listen to commands, the bridge's own nodes too."""
         infos = self.node.get_subscriptions_info_by_topic(self.name)

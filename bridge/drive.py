@@ -247,6 +247,9 @@ def main(arguments: list[str] | None = None) -> int:
         if options.compressed and policy.pacer.kind != "camera":
             raise OptionError(f"--compressed is of camera images, and {options.policy} is paced by a "
                               f"{policy.pacer.kind}. Leave it out.")
+        if options.image_topic != ros.IMAGE_TOPIC and policy.pacer.kind != "camera":
+            raise OptionError(f"--image-topic {options.image_topic}: {options.policy} has no camera. Leave it out, and "
+                              f"remap the topic of its {policy.pacer.kind} with --ros-args -r.")
         safety = safety_config(policy, options)
         view = view_of(policy.pacer, options.crop and tuple(options.crop), options.calibration)
     except ValueError as error:

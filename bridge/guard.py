@@ -137,6 +137,8 @@ class GuardNode:
 
     def _on_heartbeat(self, message: Any) -> None:
         beat = read_beat(message.data, session=str, driving=bool)
+        if isinstance(name := beat.get("node"), str) and self.topic.know(name):  # of another name than usual: no base
+            self._ready = False  # until the next look
         if beat and self._follow in ("", beat["session"]):
             self._followed = time.monotonic()
             self.watchdog.heartbeat(self.now(), beat["session"], beat["driving"])

@@ -274,8 +274,10 @@ def managed_node(name: str) -> Any:
             return TransitionCallbackReturn.SUCCESS
 
         def on_activate(self, state: Any) -> Any:
-            self.on_active_change(True)
-            return super().on_activate(state)
+            result = super().on_activate(state)
+            if result == TransitionCallbackReturn.SUCCESS:  # else it stays inactive
+                self.on_active_change(True)
+            return result
 
         def on_deactivate(self, state: Any) -> Any:
             self.on_active_change(False)

@@ -63,6 +63,9 @@ class Decider(Protocol):
 class VehicleNode:
     """Connects one decider to the ROS graph."""
 
+    name = ""
+    """Full name of the node; its guard takes it for no base."""
+
     def __init__(self, node: Any, decider: Decider, options: argparse.Namespace,
                  now: Callable[[], float] = time.monotonic) -> None:
         """Join the graph; call `start` when the rest of the node is made.
@@ -76,7 +79,7 @@ class VehicleNode:
         from std_msgs.msg import Empty, String
 
         self.node, self.decider, self.options, self.now = node, decider, options, now
-        self.supervisor = decider.supervisor
+        self.supervisor, self.name = decider.supervisor, ros.full_name(node)
         self.commands = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
         self._drivers = [CommandListener(node, topic, "auto", self._on_driver) for topic in options.yield_to]
         self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
@@ -234,7 +237,7 @@ class VehicleNode:
 
     def _beat(self, driving: bool) -> None:
         self._said_driving = driving
-        beat = {"session": self.guard.session, "driving": driving}
+        beat = {"session": self.guard.session, "driving": driving, "node": self.name}
         self._heartbeat.publish(self._string(data=json.dumps(beat)))
 
     def _on_look(self) -> None:

@@ -59,6 +59,12 @@ class ChairState:
         """Return the state of a message; fields that older drivers lack keep their defaults."""
         return cls(**{name: getattr(message, name) for name in cls.__dataclass_fields__ if hasattr(message, name)})
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all angles and speeds of the motors are numbers: no odometry follows from others."""
+        return all(map(math.isfinite, (self.right_motor_angle, self.left_motor_angle, self.right_motor_speed,
+                                       self.left_motor_speed)))
+
 
 @dataclass(frozen=True)
 class Odometry:

@@ -27,6 +27,7 @@ from sysid.errors.pose_objective import Noise
 from sysid.intervals.design import Criterion, Subject, propose
 from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
+from sysid.search.thin import drives_from
 from whill_mjx.io.fields import Field, check_table
 from whill_mjx.io.folders import check_file, note_written
 from whill_mjx.vehicle.parameters import describe
@@ -80,7 +81,7 @@ def main(config: DesignConfig) -> list[Path]:
             min(spec.v_max, 1.0) if config.v_max is None else config.v_max,
             min(spec.omega_max, 1.0) if config.omega_max is None else config.omega_max, config.space,
             float(np.hypot(spec.body_length, spec.body_width)) / 2 if config.margin is None else config.margin,
-            config.seconds)
+            config.seconds, least=drives_from(spec))
         command_line.stage("simulating the manoeuvres of the library: half a minute, most of it compilation")
         found = propose(subject, limits, channels=config.channels, criterion=config.criterion, count=config.count,
                         names=config.parameters or None)

@@ -86,7 +86,7 @@ def main(arguments: Arguments) -> None:
                 spec, vehicle = load_fitted(settings.vehicle)
                 asked, *references = (of_file(one, spec, str(settings.vehicle)) for one in (log, *references))
     chosen = {"data": log.sha256, "train": arguments.train, "held_out": arguments.held_out,
-              "chained": arguments.chained, **settings_of(settings)}
+              "chained": arguments.chained, **settings_of(settings, model=model)}
     with run_folder(arguments.out, KIND, OUTPUTS, chosen, {"references": [one.sha256 for one in references]}):
         fit(arguments, settings, log, model)
         if arguments.close_loop:

@@ -13,6 +13,7 @@ import jax
 
 from sysid.pages.report import code_hashes
 from sysid.replay.cores import cores
+from sysid.replay.models import Model
 from sysid.search.studies import without_secrets
 from whill_mjx.io.folders import claim_folder
 from whill_mjx.io.steps import keep_steps
@@ -42,13 +43,16 @@ def run_folder(
             yield
 
 
-def settings_of(config: Any, without: Iterable[str] = ()) -> dict[str, Any]:
-    """Name -> value of a settings dataclass for an identity, passwords hidden; files by their content."""
+def settings_of(config: Any, without: Iterable[str] = (), model: Model | None = None) -> dict[str, Any]:
+    """Name -> value of a settings dataclass for an identity, passwords hidden; files by their content, those too of
+    which a `model` was made."""
     found = {name: value for name, value in asdict(config).items() if name not in without}
     for name in {"vehicle", "model"} & set(found):
         found[name] = file_label(found[name])
-    if (model := Path(str(getattr(config, "model", None)))).suffix in ROBOT_FILES and model.is_file():
-        found["model_parts"] = parts_label(model)
+    if (file := Path(str(getattr(config, "model", None)))).suffix in ROBOT_FILES and file.is_file():
+        found["model_parts"] = parts_label(file)
+    elif model is not None and model.files:
+        found["model_parts"] = files_label(part for one in model.files for part in (one, *_parts(one)))
     if "storage" in found:
         found["storage"] = without_secrets(found["storage"])
     return found
@@ -66,8 +70,18 @@ def file_label(path: Path | str | None) -> str | None:
 
 
 def parts_label(path: Path) -> str:
-    """Number of the files that a robot file includes and of its meshes, with a checksum of names and contents."""
+    """`files_label` of those that a robot file includes and of its meshes."""
+    return files_label(_parts(path))
+
+
+def _parts(path: Path) -> list[Path]:
+    """Files that are part of a robot file besides it; none of another one."""
     from sysid.replay.robot_files import read_robot
 
-    parts = sorted((one.name, hashlib.sha256(one.read_bytes()).hexdigest()) for one in read_robot(path).parts)
+    return read_robot(path).parts if path.suffix in ROBOT_FILES else []
+
+
+def files_label(files: Iterable[Path]) -> str:
+    """Number of files, with a checksum of names and contents."""
+    parts = sorted((one.name, hashlib.sha256(one.read_bytes()).hexdigest()) for one in files)
     return f"{len(parts)} files {hashlib.sha256(repr(parts).encode()).hexdigest()[:12]}"

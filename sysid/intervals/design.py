@@ -15,6 +15,7 @@ from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, placement
 from sysid.replay.records import Measured, Plant, Simulated
 from sysid.replay.rollout import Replay, make_batch, vehicle_plant
+from sysid.search.thin import drives_from
 from whill_mjx.effects.pose_mount import PoseMount
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import set_values
@@ -152,7 +153,8 @@ def propose(
     `channels`: what will be measured; `names`: parameters of interest, by default all that a log can determine.
     """
     spec, params = subject.spec, tracked_at_axle(subject.params)
-    limits = limits or Limits(max(spec.v_min, -1.0), min(spec.v_max, 1.0), min(spec.omega_max, 1.0))
+    limits = limits or Limits(max(spec.v_min, -1.0), min(spec.v_max, 1.0), min(spec.omega_max, 1.0),
+                              least=drives_from(spec))
     space = make_space(params, spec, names)
     plant = vehicle_plant(spec, VehicleConfig(physics_dt=0.01))
     candidates = tuple(library(limits))

@@ -1,5 +1,6 @@
 """Poses that contradict the speeds beside them: another axis, frame or clock, a reset, or speeds that are none;
-and poses that no vehicle drives: jumps from row to row, rows that stand still, columns that never change.
+and poses that no vehicle drives: jumps from row to row, rows that take turns between two poses or stand still, columns
+that never change.
 
 Clocks are compared by rates of turning and of motion, since no frame changes them.
 """
@@ -29,7 +30,7 @@ from sysid.logs.directions import (
     pooled,
 )
 from sysid.logs.planar import differenced, half_span
-from sysid.logs.records import Trial, logged_pose
+from sysid.logs.records import OdometryStream, PoseStream, Trial, logged_pose
 from sysid.logs.streams import SMOOTHING, speeds
 
 LITTLE = 0.75  # share of the motion that a direction must explain, below which something is wrong
@@ -46,6 +47,8 @@ DRIFT = 0.3  # s by which clocks must come apart in a drive to differ from a del
 MOST, FAST, RATE_STEP = 0.15, 0.2, 0.005  # by which a clock may run fast or slow, how far is searched, and its steps
 JUMP = (0.1, 3.0)  # m or rad, and times the way that the speed gives, of a step that is a jump
 RARE = (3, 0.05)  # jumps of one drive, and of the rows of an outside pose; more are noise
+TURNS, ROWS = 0.5, 100  # share of the squared steps from row to row, and rows that show it
+"""Squared steps over two rows, below which rows take turns: of noise alone they are as large, of motion larger."""
 HELD = 0.5  # s for which rows repeat before a jump when a driver was held up
 FROZEN = 1.0  # s for which rows repeat that is longer than a driver takes between two updates
 STILL = 1e-3  # m/s and rad/s below which a speed is none
@@ -71,7 +74,8 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
 
 def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) -> list[str]:
     empty = _empty_speeds(trials) if name == "odometry" else []
-    if found := constant_columns(name, trials) or frozen(name, trials) or [*jumps(name, trials), *empty]:
+    if found := (constant_columns(name, trials) or frozen(name, trials) or two_sources(name, trials)
+                 or [*jumps(name, trials), *empty]):
         return found
     motions = [motion for trial in trials if (motion := motion_of(trial, name)) is not None]
     if name == "odometry" and motions and in_fixed_frame(motions) and not _is_mirrored(motions, reach):
@@ -300,6 +304,25 @@ def _jumps_of(name: str, trial: Trial) -> np.ndarray:
     most = RARE[0] if name == "odometry" else max(RARE[0], RARE[1] * len(dt))
     at = np.flatnonzero(found)
     return at if len(at) <= most else at[:0]
+
+
+def two_sources(name: str, trials: Sequence[Trial]) -> list[str]:
+    """A sentence on a pose whose rows take turns between two."""
+    found = [(trial, apart) for trial in trials if (apart := _taking_turns(getattr(trial, name)))]
+    if not found:
+        return []
+    trial, apart = found[0]
+    return [f"{name}: in {len(found)} of {len(trials)} trials ({trial.name}) its rows take turns between two poses "
+            f"{apart:.2g} m apart, as where two nodes send on one topic. Record each on a topic of its own."]
+
+
+def _taking_turns(stream: OdometryStream | PoseStream | None) -> float:
+    """How far the two poses are apart [m] between which rows take turns; 0 where they do not."""
+    if (pose := logged_pose(stream, ROWS)) is None:
+        return 0.0
+    place = pose.x + 1j * pose.y
+    next_one, over_two = (float(np.mean(np.square(np.abs(place[k:] - place[:-k])))) for k in (1, 2))
+    return float(np.sqrt(next_one)) if over_two < TURNS * next_one else 0.0
 
 
 def frozen(name: str, trials: Sequence[Trial]) -> list[str]:

@@ -15,7 +15,7 @@ from sysid.logs.bags.clocks import clock_notes, in_order, stream_times
 from sysid.logs.bags.reader import read_bag
 from sysid.logs.bags.recording import OPTIONS, PACKED, find_bags
 from sysid.logs.coverage import sanity
-from sysid.logs.dataset_writing import HEADERS, Found, write_dataset
+from sysid.logs.dataset_writing import HEADERS, Found, copies, write_dataset
 from sysid.logs.drive_cuts import SHORTEST, ConvertConfig, Drive, Source, at_axle, cut_drives, trial_drive
 from sysid.logs.log import load_log, read_csv, read_fields, spec_from_fields
 from sysid.logs.measured import detect_format, is_known, load_whole
@@ -61,7 +61,7 @@ def convert(config: ConvertConfig) -> tuple[Log, list[str]]:
         found = replace(found, more={**found.more, "command_timeout": config.command_timeout})
     kept_out = [name for name in found.held_out if name in names]
     held_out = config.held_out or (kept_out if there is None else ())
-    notes = [*found.notes, *write_dataset(config.out, found, held_out, config.source)]
+    notes = [*found.notes, *copies(drives), *write_dataset(config.out, found, held_out, config.source)]
     log = load_log(config.out)
     if there is not None and (fitted := sorted(set(kept_out) - {trial.name for trial in log.held_out})):
         notes.append(f"{', '.join(fitted)}: held out in {config.source}, but not here. Add "

@@ -34,6 +34,15 @@ class Found:
     beside: Mapping[str, Path] = field(default_factory=dict)  # trial -> its folder, of which encoder.csv is kept
 
 
+def copies(drives: Sequence[Drive]) -> list[str]:
+    """Notes on drives that hold the same numbers as an earlier one."""
+    first: dict[tuple[bytes, ...], str] = {}
+    pairs = [(drive.name, first.setdefault(tuple(b"" if one is None else one.tobytes() for one in (
+        drive.command, drive.odometry, drive.ground_truth)), drive.name)) for drive in drives]
+    return [f"{name} is a copy of {other}: as replicates they would show a noise of 0, and held out it would be seen "
+            "before. Leave one out" for name, other in pairs if name != other]
+
+
 def write_dataset(folder: Path, found: Found, held_out: Sequence[str] = (), source: Path | None = None) -> list[str]:
     """Write the trials that the loader accepts into a dataset folder, and note those left out; an existing dataset
     keeps its fields and trials. `source`: named in errors.

@@ -34,6 +34,7 @@ class Limits:
     margin: float = 0.6  # how far the drive-axle centre stays from its edges [m]: the reach of the body
     seconds: float = 20.0  # time in motion at most [s]
     dt: float = 0.1  # command period [s]
+    least: float = 0.05  # speed [m/s] below which reversing shows nothing: of the chair
 
     def __post_init__(self) -> None:
         if not (self.v_max > 0 and self.v_min <= 0 and self.omega_max > 0):
@@ -127,7 +128,7 @@ def library(limits: Limits | None = None) -> tuple[Candidate, ...]:
             v, omega = size * limits.v_max, size * limits.omega_max
             if name in REVERSING:
                 v = min(v, -size * limits.v_min)
-                if v < 0.05:
+                if v < limits.least:
                     continue
             command = _longest(name, v, omega, limits)
             if command is not None:

@@ -61,6 +61,11 @@ def without_wraps(angle: np.ndarray) -> np.ndarray:
     return np.concatenate([angle[:1], angle[0] + np.cumsum(steps)])
 
 
+def rates_left_at_zero(angles: np.ndarray, rates: np.ndarray) -> bool:
+    """Whether a driver leaves the rates (T, 2) of two wheels at 0, while their angles (T, 2) [rad] move."""
+    return bool(not rates.any() and np.isfinite(angles).all() and np.ptp(angles, axis=0).any())
+
+
 def unwrapped(yaw: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Heading (T,) without jumps of full turns [rad].
 

@@ -13,6 +13,7 @@ from sysid.logs.metrics import METRICS, own_floor
 from sysid.logs.records import Prediction, Trial
 from sysid.missing.catalogue import base_values
 from sysid.missing.evidence import Evidence, Solver, at_fit
+from sysid.missing.joint_fit import Refit
 from sysid.missing.signatures import group_names
 from sysid.replay.rollout import predictions
 from sysid.verdict.falsifiers import as_report as predictions_of
@@ -113,18 +114,32 @@ def form_curves(result: Result) -> dict[str, list[dict[str, Any]]]:
 
 
 def base_table(result: Result) -> list[dict[str, Any]]:
-    """Base parameters on these drives beside the reference."""
+    """Base parameters on these drives beside the reference; `away` is `shown_move` in day-to-day spreads."""
     space, reference = result.reference.space, result.reference
     spread = np.sqrt(np.diag(reference.spread))
     before, after = (np.asarray(get_values(one, list(space.names)), float)
                      for one in (fitted_before(result), fitted_after(result)))
-    away = (space.to_unit(after) - reference.u) / spread
+    fit = result.search.final if result.search.verdict == "named" else result.search.base
+    away = shown_move(fit, result.evidence.precision, space.to_unit(after) - reference.u) / spread
     slope = space.slope(reference.u)
     return [{"name": name, "unit": unit, "reference": float(space.to_values(reference.u)[i]),
              "spread": float(spread[i] * slope[i]), "value": float(space.to_values(result.search.final.u)[i]),
              "before": float(before[i]), "after": float(after[i]), "away": float(away[i])}
             for i, (name, unit) in enumerate((name, describe(result.reference.params)[name].unit)
                                              for name in space.names)]
+
+
+def shown_move(fit: Refit, precision: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """The part (P,) of a move (P,) of base parameters, in unit coordinates, that drives show beside a fit's effects.
+
+    A fit to whole poses is free where drives determine nothing, as without an outside pose. Of all moves that explain
+    the drives as well, the one counts that is most likely from day to day (`precision` (P, P)).
+    """
+    flat = fit.jacobian.reshape(-1, fit.jacobian.shape[-1])
+    base, effects = flat[:, :len(moved)], flat[:, len(moved):]
+    alone = base - effects @ (np.linalg.pinv(effects) @ base)  # what the effects cannot do instead
+    shown = alone.T @ alone
+    return np.asarray(np.linalg.solve(shown + precision, shown @ moved))
 
 
 def new_days(result: Result) -> Days:

@@ -113,7 +113,7 @@ def mjcf_model(
 
     skids = calibrate and len(robot.wheels) > 2
     return Model(robot.path.name, plant, params, write, robot.notes, around, vehicle,
-                 partial(skid_vehicle, robot) if skids else None).with_effects(effects)
+                 partial(skid_vehicle, robot) if skids else None, (Path(path).resolve(),)).with_effects(effects)
 
 
 def _searched(

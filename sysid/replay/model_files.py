@@ -6,7 +6,9 @@ import hashlib
 import importlib.util
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +16,8 @@ from sysid.replay.models import Model
 from whill_mjx.effects import EFFECTS
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
+
+_BESIDE = set[str]()  # names of the modules beside the model that was loaded last
 
 
 def steps_mjx(text: str | None, wheels: Sequence[str] = (), parameters: Sequence[str] = ()) -> bool:
@@ -60,15 +64,38 @@ def load_model(text: str, spec: VehicleSpec, wheels: Sequence[str] = (), paramet
                           calibrate=not inside)
     if path.suffix != ".py":
         raise ValueError(f"{path}: a model is {', '.join(ROBOT_FILES)} or .py. Rename the file or write an adapter.")
-    module = _run(path)
-    if not hasattr(module, attribute):
-        raise ValueError(f"{path}: defines no {attribute!r}. Give FILE.py:NAME, or name the model `model`.")
-    found = getattr(module, attribute)
-    found = found if isinstance(found, Model) or not callable(found) else found(spec)
+    with _modules_beside(path) as beside:
+        module = _run(path)
+        if not hasattr(module, attribute):
+            raise ValueError(f"{path}: defines no {attribute!r}. Give FILE.py:NAME, or name the model `model`.")
+        found = getattr(module, attribute)
+        found = found if isinstance(found, Model) or not callable(found) else found(spec)
     if not isinstance(found, Model):
         raise ValueError(f"{path}: {attribute} is a {type(found).__name__}; it must be a sysid.replay.models.Model. "
                          "Make it with function_model or mjcf_model.")
-    return found
+    return replace(found, files=(*found.files, *beside))
+
+
+@contextmanager
+def _modules_beside(path: Path) -> Iterator[list[Path]]:
+    """Import modules in the folder of a file first, as Python does where it runs one; the list gets their files at the
+    end. Those beside a model that was loaded before are read anew: others may have the same names."""
+    for name in [one for one in sys.modules if one.partition(".")[0] in _BESIDE]:
+        del sys.modules[name]
+    _BESIDE.clear()
+    folder, before, files = path.resolve().parent, set(sys.modules), list[Path]()
+    importlib.invalidate_caches()
+    sys.path.insert(0, str(folder))
+    try:
+        yield files
+    finally:
+        sys.path.remove(str(folder))
+        for name in sys.modules.keys() - before:
+            top, file = name.partition(".")[0], Path(getattr(sys.modules[name], "__file__", None) or "")
+            if top not in before and file.is_relative_to(folder) and file.relative_to(folder).parts[:1] in (
+                    (top,), (f"{top}.py",)):
+                files.append(file)
+                _BESIDE.add(top)
 
 
 def _run(path: Path) -> ModuleType:

@@ -69,6 +69,7 @@ class Model:
     """The vehicle of the simulator that drives alike, or why there is none."""
     instead: Callable[[VehicleSpec], Twin] | None = None
     """The vehicle of the simulator that a fit takes in its place, of a log's spec; none where it fits the model."""
+    files: tuple[Path, ...] = ()  # what it was made of: a robot's file, and modules beside a Python file
 
     def with_effects(self, names: Sequence[str]) -> Model:
         """The same model with effects of the catalogue around it; ValueError for those that act inside one."""

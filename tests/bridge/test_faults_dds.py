@@ -153,3 +153,20 @@ def test_lifecycle_node_drives_only_while_it_is_active(graph, policy):
     robot.wait_until(lambda robot: robot.commands[-1][1:] == (0.0, 0.0))
     change(Transition.TRANSITION_ACTIVATE)
     robot.wait_for_status(driving=True)
+
+
+@pytest.mark.parametrize("succeeds", [True, False])
+def test_lifecycle_node_keeps_its_hold_where_activation_fails(graph, monkeypatch, succeeds):
+    from rclpy.lifecycle import LifecycleNode
+    from rclpy.lifecycle import TransitionCallbackReturn as Result
+
+    from bridge import ros
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    changes = []
+    with ros.node_session("managed", [], managed=True) as node:
+        node.on_active_change = changes.append
+        monkeypatch.setattr(LifecycleNode, "on_activate", lambda *_: Result.SUCCESS if succeeds else Result.FAILURE)
+        node.trigger_configure()
+        node.trigger_activate()
+    assert changes == ([True] if succeeds else [])

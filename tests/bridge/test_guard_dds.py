@@ -1,8 +1,11 @@
 """Nothing drives without a guard, and a guard stops what dies."""
 
+import json
 import os
 import signal
 import time
+
+from benchmarks.bridge_robot import message_type
 
 
 def drive_alone(graph, policy, *options):
@@ -104,3 +107,16 @@ def child_of(pid):
     with open(f"/proc/{pid}/task/{pid}/children") as file:
         (child,) = file.read().split()
     return int(child)
+
+
+def test_a_bridge_of_another_name_is_no_base_to_its_guard(graph, policy):
+    beats = []
+    robot = graph.peer("robot")
+    robot.watch(), robot.camera(), robot.e_stop()
+    robot.node.create_subscription(message_type("std_msgs/String"), "bridge/guard",
+                                   lambda message: beats.append(json.loads(message.data)), 10)
+    graph.start("drive", policy, "--command-type", "Twist", "--ros-args", "-r", "__node:=pilot")
+    robot.wait_until(lambda _: sum(bool(beat["hears"]) for beat in beats) > 20)  # a second
+    assert not any(beat["ready"] for beat in beats if beat["hears"])
+    robot.base()
+    robot.wait_for_status(driving=True)

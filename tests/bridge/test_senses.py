@@ -9,6 +9,8 @@ import pytest
 import tiny_policy
 
 from bridge.controller import Controller
+from bridge.drive import main
+from bridge.exits import Exit
 from bridge.policy import Policy, PolicyFileError, SensorInput
 from bridge.safety import SafetyConfig, Supervisor
 from bridge.sense_topics import reader_of
@@ -237,3 +239,10 @@ def test_policy_without_a_camera_is_paced_by_its_lidar():
              (("goal", "goal", (2,)), ("scan", "lidar", (36,)), ("commands", "commands", (2,)))}  # fmt: skip
     assert pacer_of(found).name == "scan" and pacer_of({"commands": found["commands"]}) is None
     assert dataclasses.replace(found["scan"], settings={"rate_hz": 5.0, "latency_s": 0.1}).age == pytest.approx(0.3)
+
+
+def test_an_image_topic_is_refused_where_the_policy_has_no_camera(monkeypatch, capsys):
+    lidar = SimpleNamespace(pacer=LIDAR, sensors={"lidar": LIDAR})
+    monkeypatch.setattr("bridge.drive.Policy.load", lambda path: lidar)
+    assert main(["walls", "--image-topic", "scanner/scan"]) == Exit.REFUSED
+    assert "--image-topic scanner/scan: walls has no camera" in capsys.readouterr().err

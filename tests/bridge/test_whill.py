@@ -8,8 +8,10 @@ import pytest
 from fake_chair import FakeChair
 
 from bridge.bases import WHILL
+from bridge.chair import ChairNode, parse_arguments
 from bridge.safety import SafetyConfig, State, Supervisor
 from bridge.whill import (
+    WHEEL_RADIUS,
     ChairGate,
     ChairState,
     WheelOdometry,
@@ -189,3 +191,24 @@ def test_state_of_an_older_driver_lacks_the_joystick_and_is_read_all_the_same():
     fields = {name: 1 for name in ChairState.__dataclass_fields__ if not name.startswith("joy")}
     state = ChairState.of(types.SimpleNamespace(**fields))
     assert state.error == 1 and state.joy_front == 0
+
+
+@pytest.mark.parametrize("change", [{"left_motor_angle": math.inf}, {"right_motor_angle": math.nan},
+                                    {"right_motor_speed": -math.inf}])
+def test_state_that_is_not_finite_gives_no_odometry_and_those_after_it_go_on(monkeypatch, change):
+    pytest.importorskip("nav_msgs.msg")
+    time = pytest.importorskip("builtin_interfaces.msg").Time
+    now, published, said = [0.0], [], []
+    monkeypatch.setattr("bridge.chair.ros.chair_state_type", lambda: None)
+    monkeypatch.setattr("bridge.chair.time.monotonic", lambda: now[0])
+    node = types.SimpleNamespace(
+        create_publisher=lambda *_: types.SimpleNamespace(publish=published.append),
+        create_subscription=lambda *_: None, get_logger=lambda: types.SimpleNamespace(warning=said.append),
+        get_clock=lambda: types.SimpleNamespace(now=lambda: types.SimpleNamespace(to_msg=time)))
+    chair = ChairNode(node, parse_arguments([]))
+    for k in range(4):
+        now[0] = 0.1 * k
+        state = {"left_motor_angle": 0.2 * k, "right_motor_angle": -0.2 * k}
+        chair._on_state(types.SimpleNamespace(**(state | change if k == 2 else state)))
+    assert len(published) == 3 and chair.unusable == 1 and len(said) == 1
+    assert published[-1].pose.pose.position.x == pytest.approx(0.6 * WHEEL_RADIUS)

@@ -135,6 +135,31 @@ def test_topics_that_may_be_meant_are_asked_for_and_speeds_to_the_side_are_named
     assert any("up to 0.3 m/s sideways" in note for note in notes)
 
 
+@pytest.mark.parametrize("topic", [ODOMETRY, TRUTH])
+@pytest.mark.parametrize("child", ["base_footprint", "base_link"])
+def test_of_two_nodes_that_send_on_one_topic_one_is_taken_or_they_are_named(tmp_path, topic, child):
+    def doubled(rows):
+        more = []
+        for t, name, kind, one in rows:
+            if name == topic:
+                place = one.pose.pose.position
+                other = odometry(T0 + t, place.x + 0.3, place.y - 0.2, 0.0, one.twist.twist.linear.x, 0.0)
+                other.pose.pose.orientation = one.pose.pose.orientation
+                other.twist.twist.angular.z, other.child_frame_id = one.twist.twist.angular.z, child
+                more.append((t + 0.02, name, kind, other))
+        return sorted([*rows, *more[3:]], key=lambda row: row[0])
+
+    log, notes = convert(ConvertConfig(write_bag(tmp_path / "drive", edit=doubled, late=0.0), tmp_path / "data"))
+    alone, _ = convert(ConvertConfig(write_bag(tmp_path / "alone", late=0.0), tmp_path / "data_alone"))
+    stream = "odometry" if topic == ODOMETRY else "ground_truth"
+    if child == "base_link":
+        assert any(f"{stream}: in 1 of 1 trials" in one and "take turns between two poses 0.3" in one for one in notes)
+        return
+    assert any(f"{topic}: messages in the frames 'odom to base_footprint' (" in note for note in notes)
+    for mine, theirs in zip(log.trials, alone.trials, strict=True):
+        np.testing.assert_allclose(getattr(mine, stream).x, getattr(theirs, stream).x, atol=1e-6)
+
+
 def test_joint_states_beside_commands_are_the_odometry(tmp_path):
     kind = "sensor_msgs/msg/JointState"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -25,9 +27,11 @@ from sysid.logs.manoeuvre_library import Candidate, Limits, as_trial, library, m
 from sysid.logs.metrics import ideal_replay
 from sysid.replay.models import with_effects
 from sysid.replay.records import Plant
+from sysid.search.thin import drives_from
+from whill_mjx.io.command_line import OptionError
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.presets import preset_params
-from whill_mjx.vehicle.specs import WHILL_CR
+from whill_mjx.vehicle.specs import WHILL_CR, in_proportion
 
 quick = pytest.mark.quick
 SMALL = Limits(v_min=-0.5, v_max=0.6, omega_max=0.8, room=(4.0, 3.0), margin=0.5, seconds=12.0)
@@ -58,6 +62,29 @@ def test_candidates_keep_speed_and_room(limits):
 @quick
 def test_a_vehicle_that_must_not_reverse_gets_no_reversing_manoeuvre():
     assert not any((one.command.v < 0).any() for one in library(Limits(v_min=0.0)))
+
+
+@quick
+def test_a_slow_small_robot_gets_the_manoeuvres_that_turn_while_they_reverse():
+    spec = in_proportion(WHILL_CR, "small", wheel_radius=0.012, track=0.045)
+    limits = Limits(v_min=-0.04, v_max=0.04, room=(1.0, 1.0), margin=0.05, least=drives_from(spec))
+    assert {"arcs", "prbs", "chirp"} <= {one.name for one in library(limits)}
+    assert not {"arcs", "prbs", "chirp"} & {one.name for one in library(replace(limits, least=0.05))}
+
+
+@quick
+def test_the_command_designs_for_a_small_robot_by_its_size(tmp_path, monkeypatch):
+    seen = []
+
+    def propose(subject, limits, **options):
+        seen.append(limits.least)
+        raise ValueError("seen")
+
+    monkeypatch.setattr(design_command, "propose", propose)
+    for vehicle in ("whill_cr", "create"):
+        with pytest.raises(OptionError, match="seen"):
+            main(DesignConfig(vehicle, out=tmp_path / "command.csv"))
+    assert seen[0] == 0.05 and seen[1] == pytest.approx(0.05 * 0.033 / 0.1325)
 
 
 @quick

@@ -11,6 +11,7 @@ import pytest
 
 import sysid
 from sysid.errors.noise import fit_roughness, fit_whitener
+from sysid.errors.space import make_space
 from sysid.logs.log import load_log
 from sysid.missing.catalogue import Axis, Hypothesis, base_values, hypotheses, with_catalogue
 from sysid.missing.days import Wander
@@ -21,7 +22,8 @@ from sysid.missing.refit import Refitter
 from sysid.missing.signatures import signature_columns
 from sysid.missing.wander import _pooled
 from sysid.pages.loop_page import not_determined
-from sysid.pages.loop_tables import in_range
+from sysid.pages.loop_tables import base_table, in_range
+from sysid.pages.loop_words import shifts
 from sysid.pages.verdict_picture import account, draw
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
@@ -33,6 +35,7 @@ from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import imitation
 from whill_mjx.effects import about_of
 from whill_mjx.effects.supply_sag import ROUND
+from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import preset
 
 
@@ -345,6 +348,34 @@ def test_a_channel_that_was_not_measured_is_no_rougher():
     factors = fit_roughness(series * np.where(level == 3, 4.0, 1.0)[..., None] * mask, mask, level)
     assert np.allclose(factors[:, 1], 1.0)
     assert 3 < factors[3, 0] < 5 and factors[0, 0] == 1
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("named", [False, True])
+def test_base_parameters_that_the_drives_do_not_determine_went_nowhere(monkeypatch, named):
+    """A fit to whole poses is free in them: of what no outside pose shows, say, it makes anything."""
+    spec, params = preset("whill_cr_physical")
+    names = ("body.com_x", "torque_drive.kp", "torque_drive.ki", "slip_traction.mu")
+    space = make_space(params, spec, names)
+    u, spread = space.to_unit(space.initial), np.full(4, 0.01)
+    columns = np.zeros((2, 3, 6))
+    columns[0, 0, 0] = columns[0, 1, 1] = columns[0, 1, 2] = columns[0, 2, 3] = columns[0, 2, 4] = 1e4
+    columns[1, 0, 5] = 1.0
+    fits = {"final": Refit((), u, np.zeros(2), 0.0, np.zeros((2, 3)), columns, u),
+            "base": Refit((), u, np.zeros(0), 0.0, np.zeros((2, 3)), columns[..., :4], u)}
+    result = SimpleNamespace(
+        reference=SimpleNamespace(space=space, spread=np.diag(spread**2), u=u, params=params),
+        evidence=SimpleNamespace(precision=np.diag(spread**-2.0)),
+        search=SimpleNamespace(verdict="named" if named else "none", **fits))
+    away = np.array([0.05, 0.05, -0.05, 0.05])  # the second and third as one, and the fourth as an effect does
+    moved = set_values(params, names, space.to_values(u + away))
+    monkeypatch.setattr("sysid.pages.loop_tables.fitted_before", lambda _: moved)
+    monkeypatch.setattr("sysid.pages.loop_tables.fitted_after", lambda _: moved)
+    found = [row["away"] for row in base_table(result)]
+    np.testing.assert_allclose(found, [5.0, 0.0, 0.0, 0.0 if named else 5.0], atol=0.05)
+    columns[...] = 0.0  # as of a channel that is left out
+    np.testing.assert_allclose([row["away"] for row in base_table(result)], 0.0, atol=1e-9)
+    assert shifts(base_table(result)) == []
 
 
 @dataclass(frozen=True)

@@ -537,6 +537,71 @@ def test_a_model_that_is_not_there_ends_with_an_error(function_file, text, error
         load_model(str(function_file.parent / text), WHILL_CR)
 
 
+OWN = """
+import jax.numpy as jnp
+from gains import GAIN
+from sysid.replay.models import function_model
+
+def other(spec):
+    from parts.more import LOW
+    return function_model(lambda p, state, command: p["gain"] * state, {"gain": (GAIN, LOW, 2.0)}, dt=0.01)
+
+model = function_model(lambda p, state, command: p["gain"] * state, {"gain": (GAIN, 0.5, 2.0)}, dt=0.01)
+"""
+
+
+def own_model(folder, gain):
+    """A Python file that imports others beside it."""
+    (folder / "parts").mkdir(parents=True, exist_ok=True)
+    (folder / "gains.py").write_text(f"GAIN = {gain}\n")
+    (folder / "parts" / "__init__.py").write_text("")
+    (folder / "parts" / "more.py").write_text("LOW = 0.25\n")
+    (folder / "own.py").write_text(OWN)
+    return folder / "own.py"
+
+
+@pytest.mark.quick
+def test_modules_beside_a_model_file_are_found_each_by_its_own_model(tmp_path):
+    paths = list(sys.path)
+    for folder, gain in (("a", 1.0), ("b", 1.125), ("a", 1.0)):
+        file = own_model(tmp_path / folder, gain)
+        assert load_model(str(file), WHILL_CR).params.values["gain"] == gain
+        found = load_model(f"{file}:other", WHILL_CR)
+        assert dict(found.params.about)["gain"].low == 0.25
+        beside = [file.parent / "gains.py", *(file.parent / "parts" / name for name in ("__init__.py", "more.py"))]
+        assert sorted(found.files) == sorted(one.resolve() for one in beside)
+    assert sys.path == paths
+
+
+@pytest.mark.quick
+def test_another_module_beside_a_model_file_makes_another_run(tmp_path):
+    file = own_model(tmp_path, 1.0)
+
+    def go_on():
+        config = FitConfig(model=str(file))
+        with run_folder(tmp_path / "run", "sysid.fit", (), settings_of(config, model=load_model(str(file), WHILL_CR))):
+            (tmp_path / "run" / "work").touch()
+
+    go_on()
+    go_on()
+    own_model(tmp_path, 1.125)
+    with pytest.raises(FolderRefused, match="model_parts is 1 files"):
+        go_on()
+
+
+@pytest.mark.quick
+def test_another_robot_file_of_a_model_file_makes_another_run(tmp_path):
+    robot, file = tmp_path / "robot.xml", tmp_path / "own.py"
+    wheels = ("left", "right_motor")
+    file.write_text(f"from sysid import mjcf_model\nmodel = mjcf_model({str(robot)!r}, wheels={wheels})\n")
+    labels = []
+    for mass in ("0.5", "0.6"):
+        robot.write_text(ROBOT.replace('mass="0.5"', f'mass="{mass}"'))
+        model = load_model(str(file), WHILL_CR)
+        labels.append(settings_of(FitConfig(model=str(file)), model=model)["model_parts"])
+    assert labels[0].startswith("1 files") and labels[0] != labels[1]
+
+
 @pytest.mark.quick
 def test_a_model_file_may_hold_dataclasses(tmp_path):
     """With annotations that are text, dataclasses look up the module that they are in."""

@@ -216,6 +216,39 @@ def test_a_wheel_that_counts_backwards_is_named_and_turned_by_a_flag(tmp_path, s
     check(again.trials[0], pose=False)
 
 
+@pytest.mark.parametrize("rate", ["left_speed", "left_mps"])
+@pytest.mark.parametrize("backward", [1.0, -1.0])
+def test_speeds_that_a_driver_leaves_at_zero_are_taken_from_the_angles_of_the_wheels(tmp_path, rate, backward):
+    c, table = columns(), {}
+    for side, sign in (("left", -1), ("right", 1)):
+        turned = (c["v"] + sign * 0.248 * c["w"]) / 0.1325
+        table[f"{side}_angle_rad"] = (backward if side == "right" else 1.0) * np.concatenate(
+            [[0.0], np.cumsum((turned[1:] + turned[:-1]) / 2 * np.diff(c["t"]))])
+        table[rate.replace("left", side)] = 0 * c["t"]
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"], **table})
+    if backward < 0:
+        with pytest.raises(ValueError, match="drive/right_angle_rad: the right wheel counts backwards"):
+            convert(ConvertConfig(path, tmp_path / "log"))
+        return
+    log, notes = convert(ConvertConfig(path, tmp_path / "log"))
+    assert any("the speeds of the wheels are all 0: taken from their angles" in note for note in notes)
+    np.testing.assert_allclose(log.trials[0].odometry.v, c["v"], atol=0.1)
+    np.testing.assert_allclose(log.trials[0].odometry.yaw[-1] - log.trials[0].odometry.yaw[0],
+                               c["yaw"][-1] - c["yaw"][0], atol=0.1)
+
+
+def test_one_wheel_without_a_speed_has_that_of_its_angle(tmp_path):
+    c = columns()
+    rates = {side: (c["v"] + sign * 0.248 * c["w"]) / 0.1325 for side, sign in (("left", -1), ("right", 1))}
+    turned = {side: np.append(0.0, np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(c["t"])))
+              for side, rate in rates.items()}
+    path = write(tmp_path / "drive.csv", {
+        "t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"], "left_speed_rad_s": np.gradient(turned["left"], c["t"]),
+        **{f"{side}_angle_rad": angle for side, angle in turned.items()}})
+    log, _ = convert(ConvertConfig(path, tmp_path / "log"))
+    np.testing.assert_allclose(log.trials[0].odometry.v, c["v"], atol=0.1)
+
+
 def test_the_remedy_for_a_backward_encoder_keeps_its_ticks(tmp_path):
     c = columns()
     turns = {side: np.concatenate([[0.0], np.cumsum((c["v"] + sign * 0.248 * c["w"])[1:] * np.diff(c["t"]))]) / 0.1325
@@ -435,6 +468,17 @@ def test_each_file_with_commands_and_odometry_is_a_drive(tmp_path):
                                                     "y": c["y"], "theta": c["yaw"], "v": c["v"], "w": c["w"]})
     log, _ = convert(ConvertConfig(tmp_path / "drives", tmp_path / "log"))
     assert [trial.name for trial in log.trials] == ["circle_1", "circle_2"]
+
+
+def test_a_drive_that_is_there_twice_is_named(tmp_path):
+    c = columns()
+    for name in ("drive", "drive_copy"):
+        write(tmp_path / "logs" / f"{name}.csv", with_units(c))
+    write(tmp_path / "logs" / "other.csv", with_units(columns(CHAIR["circle_1"])))
+    log, notes = convert(ConvertConfig(tmp_path / "logs", tmp_path / "data"))
+    assert len(log.trials) == 3 and [one for one in notes if "is a copy of" in one] == [
+        "drive_copy is a copy of drive: as replicates they would show a noise of 0, and held out it would be seen "
+        "before. Leave one out"]
 
 
 def test_decimal_commas_and_cells_that_are_empty_are_read(tmp_path):

@@ -54,6 +54,12 @@ def header_time(message: Any) -> float:
     return float("nan") if header is None else header.stamp.sec + header.stamp.nanosec * 1e-9
 
 
+def frames_of(message: Any) -> str:
+    """Names of the frames of a message, parent and child; empty where it has none."""
+    parent, child = getattr(getattr(message, "header", None), "frame_id", ""), getattr(message, "child_frame_id", "")
+    return " to ".join(one for name in (parent, child) if (one := str(name).strip("/")))
+
+
 def without_stamp(stamped: np.ndarray) -> np.ndarray:
     """Which stamps (T,) [s] are zero although most are set: of a driver that does set them (T,) bool."""
     zero = stamped <= 0

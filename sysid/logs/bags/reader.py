@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.bags import transforms
-from sysid.logs.bags.messages import header_time, read_message, sideways_speed, without_stamp
+from sysid.logs.bags.messages import frames_of, header_time, read_message, sideways_speed, without_stamp
 from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS, OPTIONS, PACKED, SUFFIXES, Bag, BagStream, short_type
 from sysid.logs.bags.topics import choose_topics, framed, namespaces, no_pose, not_read
 from sysid.logs.bags.wheel_states import (
@@ -31,6 +31,7 @@ from sysid.logs.bags.wheel_states import (
     usable_joints,
 )
 from sysid.logs.planar import integrate_speeds
+from whill_mjx.io.fields import shown
 from whill_mjx.io.reading import LONGEST_REASON
 
 SIDEWAYS = 0.01  # m/s of a command that is none
@@ -120,6 +121,7 @@ def _opened(reader: Any, path: Path, store: Any, notes: list[str]) -> Iterator[A
 def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, list[tuple[float, ...]]]:
     """Time of receipt and of the header [s] and columns of every message by stream; `names`: topic -> stream."""
     rows: dict[str, list[tuple[float, ...]]] = {stream: [] for stream in names.values()}
+    frames: dict[str, list[str]] = {stream: [] for stream in rows}
     sideways = 0.0
 
     def take(topic: str, kind: str, received: float, message: Any) -> None:
@@ -127,6 +129,7 @@ def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, lis
         if (stream := names[topic]) == "command":
             sideways = max(sideways, sideways_speed(message))
         rows[stream].append((received, header_time(message), *read_message(stream, kind, message)))
+        frames[stream].append(frames_of(message) if stream != "command" and kind != "JointState" else "")
 
     broken, said = _each_message(reader, names, take)
     if broken and not any(rows.values()):
@@ -135,6 +138,13 @@ def _rows(reader: Any, names: dict[str, str], notes: list[str]) -> dict[str, lis
         notes.append(f"commands also ask for up to {sideways:.2g} m/s sideways (linear.y): forward speed and yaw rate "
                      "alone are read, and no model drives sideways. Leave such drives out")
     notes += broken
+    for topic, stream in names.items():
+        (usual, _), *others = Counter(frames[stream]).most_common() or [("", 0)]
+        if others:  # a mixture of two poses is none
+            said = " and ".join(f"{shown(frame)} ({count})" for frame, count in others)
+            notes.append(f"{topic}: messages in the frames {said} are left out, since most are in {shown(usual)}: more "
+                         "than one node may send there")
+            rows[stream] = [row for row, one in zip(rows[stream], frames[stream], strict=True) if one == usual]
     return rows
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.planar import twist_of_wheels, without_wraps
+from sysid.logs.planar import rates_left_at_zero, twist_of_wheels, without_wraps
 
 CHAIR_DEFINITION = """int32 battery_power
 float32 battery_current
@@ -50,8 +50,7 @@ def chair_odometry(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: 
 def joint_twist(t: np.ndarray, rows: np.ndarray, wheel_radius: float, track: float) -> np.ndarray:
     """(T, 2) v and omega of `joint_row`s (T, 4), as `usable_joints` leaves them, at times (T,) [s]."""
     angles, rates = rows[:, :2], rows[:, 2:]
-    unfilled = not rates.any() and np.ptp(angles, axis=0).any()  # of a driver that leaves them at 0; nan where no angle
-    if not np.isfinite(rates).all() or unfilled and np.isfinite(angles).all():
+    if not np.isfinite(rates).all() or rates_left_at_zero(angles, rates):
         rates = np.gradient(np.column_stack([without_wraps(angle) for angle in angles.T]), t, axis=0)
     return np.column_stack(twist_of_wheels(rates[:, 0], rates[:, 1], wheel_radius, track))
 

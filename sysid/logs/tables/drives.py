@@ -114,9 +114,13 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     made: dict[str, np.ndarray] = {}
     if "command" in streams:
         made["command"] = as_twist(streams["command"], columns, "command", geometry)
-    wheels = as_twist(with_rates(streams["wheels"]), columns, "wheels", geometry) if "wheels" in streams else None
+    wheels, counted = None, list(columns)
+    if "wheels" in streams:
+        rates, counted, said = with_rates(streams["wheels"], columns)
+        wheels = as_twist(rates, counted, "wheels", geometry)
+        notes += said
     if wheels is not None and "command" in made and (backwards := backward_wheel(made["command"], wheels)):
-        one = next(one for one in columns if one.role.startswith(f"wheels.{backwards}"))
+        one = next(one for one in counted if one.role.startswith(f"wheels.{backwards}"))
         turned = replace(one, sign=-one.sign, unit="" if one.why else one.unit)  # a unit guessed from it may be wrong
         raise ValueError(f"{source}: {one.file}/{one.name}: the {backwards} wheel counts backwards: the two differ "
                          f"where the vehicle is sent straight ahead. Turn its sign: --columns {turned}")

@@ -7,7 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from sysid.logs.directions import RESPONSE, VARIED
-from sysid.logs.planar import DIFFERENCED, integrate_speeds, pose_speeds, twist_of_wheels, without_wraps, yaw_of
+from sysid.logs.planar import (
+    DIFFERENCED,
+    integrate_speeds,
+    pose_speeds,
+    rates_left_at_zero,
+    twist_of_wheels,
+    without_wraps,
+    yaw_of,
+)
 from sysid.logs.records import Command
 from sysid.logs.tables.columns import UNITS, Column, Table
 from sysid.logs.tables.text_table import ONE_SIDE
@@ -134,12 +142,20 @@ def _check_clock(file: str, t: np.ndarray) -> list[str]:
     return [f"{file}: {counted(late, 'row')} out of order, sorted by time"] if late else []
 
 
-def with_rates(wheels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Wheel speeds, from angles where only these were measured."""
-    if "left" in wheels:
-        return wheels
-    t = wheels["t"]
-    return {"t": t, **{side: np.gradient(without_wraps(wheels[f"{side}_angle"]), t) for side in ("left", "right")}}
+def with_rates(
+    wheels: dict[str, np.ndarray], columns: Sequence[Column]
+) -> tuple[dict[str, np.ndarray], list[Column], list[str]]:
+    """Wheel speeds, from angles where only these were measured; the columns that count, and notes."""
+    sides, angles = ("left", "right"), ("left_angle", "right_angle")
+    unfilled = {*sides, *angles} <= set(wheels) and rates_left_at_zero(
+        *(np.column_stack([wheels[one] for one in pair]) for pair in (angles, sides)))
+    if set(sides) <= set(wheels) and not unfilled:
+        return wheels, list(columns), []
+    found = {side: np.gradient(without_wraps(wheels[angle]), wheels["t"])
+             for side, angle in zip(sides, angles, strict=True)}
+    return ({"t": wheels["t"], **found},
+            [one for one in columns if one.role not in ("wheels.left", "wheels.right")],
+            ["the speeds of the wheels are all 0: taken from their angles"] if unfilled else [])
 
 
 def as_twist(rates: dict[str, np.ndarray], columns: Sequence[Column], stream: str,
