@@ -49,7 +49,7 @@ loop: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.loop --out $(LOOP)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile --durations 30
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30
 
 test-quick: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick

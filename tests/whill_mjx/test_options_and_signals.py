@@ -211,6 +211,18 @@ def test_a_signal_ends_the_process_where_no_handler_can(body, tmp_path):
     assert not after.exists()
 
 
+def test_a_signal_just_before_the_work_ends_with_one_line_too():
+    child = started("pass", first="""
+        import io, sys, time
+        class Slow(io.TextIOWrapper):
+            def reconfigure(self, **options):
+                if "errors" in options:
+                    print("begun", flush=True); time.sleep(60)
+        sys.stdout = Slow(sys.stdout.detach(), write_through=True)
+        """ + "\n")
+    assert ended(child, signal.SIGINT) == (130, "stopped; go on so. (SIGINT)")
+
+
 def test_a_signal_that_is_ignored_stays_so(tmp_path):
     """As of nohup, and of a job in the background of a script, which Ctrl-C is not meant for."""
     after = tmp_path / "after"

@@ -204,10 +204,11 @@ def guarded(stopped: str = STOPPED) -> Iterator[None]:
         stopped: the line after a signal, which says how to go on.
     """
     listen()
-    _State.working, _State.stopped = True, stopped
+    _State.stopped = stopped
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files that are not UTF-8, signs that a terminal lacks
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
+        _State.working = True  # from here on a signal is caught below
         yield
         sys.stdout.flush()
     except KeyboardInterrupt:
