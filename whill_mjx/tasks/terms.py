@@ -11,6 +11,7 @@ from flax import struct
 
 from whill_mjx.world.collision import free_distance
 from whill_mjx.world.people.crowd import TRUNK
+from whill_mjx.world.people.law import Mover, nearest_on
 from whill_mjx.world.scene import Footprint, Scene
 
 
@@ -69,16 +70,13 @@ def haste(moment: Moment, seconds: float) -> jax.Array:
     people, body = moment.scene.people, moment.body
     if people is None:
         return jnp.zeros(())
-    c, s = jnp.cos(body.yaw), jnp.sin(body.yaw)
-    heading, left = jnp.stack([c, s]), jnp.stack([-s, c])
-    off = people.position - jnp.stack([body.x, body.y])
-    along = jnp.clip(off @ heading, -body.half_length, body.half_length)
-    aside = jnp.clip(off @ left, -body.half_width, body.half_width)
-    border = along[:, None] * heading + aside[:, None] * left  # (N, 2) from the middle: what is nearest to each person
-    away = off - border
+    centre = jnp.stack([body.x, body.y])
+    heading = jnp.stack([jnp.cos(body.yaw), jnp.sin(body.yaw)])
+    half = jnp.stack([body.half_length, body.half_width])
+    border = nearest_on(Mover(centre, heading, half, moment.twist[0] * heading, moment.twist[1]), people.position)
+    away = people.position - border
     distance = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
-    towards = away / distance[:, None]
-    arm = border + jnp.stack([body.x, body.y]) - moment.pose[:2]
+    towards, arm = away / distance[:, None], border - moment.pose[:2]
     moves = moment.twist[0] * heading + moment.twist[1] * jnp.stack([-arm[:, 1], arm[:, 0]], -1)
     nears = jnp.sum(moves * towards, -1)
     comes = jnp.maximum(-jnp.sum(people.velocity * towards, -1), 0.0)

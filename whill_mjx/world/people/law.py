@@ -90,7 +90,7 @@ def _one_step(people: People, near, mover: Mover | None, dt: float) -> People:
     way = jnp.where(back[:, None], turned, eased)
 
     if mover is not None:  # to those who yield, it is a wall beside which they walk
-        side = Near(_nearest_on(mover, people.position)[:, None], people.yields[:, None])
+        side = Near(nearest_on(mover, people.position)[:, None], people.yields[:, None])
         way = _along_walls(people.position, way, side, _berth(people))
     room = _room_among_people(people, way)
     if mover is not None:
@@ -157,7 +157,7 @@ def _aside_from_people(people: People, desired: jax.Array, looks: jax.Array) -> 
 
 def _aside_from_mover(people: People, desired: jax.Array, looks: jax.Array, mover: Mover) -> jax.Array:
     """(N, 2) influence of the vehicle on those who yield."""
-    nearest = _nearest_on(mover, people.position)
+    nearest = nearest_on(mover, people.position)
     arm = nearest - mover.centre
     velocity = mover.velocity + mover.yaw_rate * jnp.stack([-arm[:, 1], arm[:, 0]], -1)
     apart = nearest - people.position
@@ -220,14 +220,14 @@ def _room_to_mover(people: People, way: jax.Array, mover: Mover) -> jax.Array:
         go = jnp.where(jnp.abs(go) < 1e-6, 1e-6, go)
         one, other = (-reach - place) / go, (reach - place) / go
         enter, leave = jnp.maximum(enter, jnp.minimum(one, other)), jnp.minimum(leave, jnp.maximum(one, other))
-    inwards = _dot(_nearest_on(mover, people.position) - people.position, way) > 0.0
+    inwards = _dot(nearest_on(mover, people.position) - people.position, way) > 0.0
     meets = (enter <= leave) & inwards & people.yields
     return jnp.where(meets, enter, jnp.inf)
 
 
 def _off_mover(people: People, place: jax.Array, mover: Mover, dt: float) -> jax.Array:
     """(N, 2) m: a step off the vehicle for those who yield, from a place that is nearer after `dt` than their berth."""
-    away = place - _nearest_on(_later(mover, dt), place)
+    away = place - nearest_on(_later(mover, dt), place)
     lacking = jnp.maximum(_berth(people) - _length(away), 0.0)
     off = jnp.minimum(lacking, dt * people.speed) * (people.yields & people.there)
     return off[:, None] * _unit(away, jnp.zeros(away.shape))
@@ -235,7 +235,7 @@ def _off_mover(people: People, place: jax.Array, mover: Mover, dt: float) -> jax
 
 def stepped_back(people: People, near, mover: Mover, time: jax.Array) -> jax.Array:
     """(N, 2) m by which people step straight off the vehicle in a time (N,) [s], as far as walls behind them let."""
-    away = people.position - _nearest_on(mover, people.position)
+    away = people.position - nearest_on(mover, people.position)
     step = (time * people.speed)[:, None] * _unit(away, jnp.zeros(away.shape))
     return _short_of_walls(people.position, step, people.position, near(people.position))
 
@@ -304,7 +304,7 @@ def _own_frame(mover: Mover, place: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _dot(off, mover.axis), off[..., 1] * mover.axis[0] - off[..., 0] * mover.axis[1]
 
 
-def _nearest_on(mover: Mover, place: jax.Array) -> jax.Array:
+def nearest_on(mover: Mover, place: jax.Array) -> jax.Array:
     """(N, 2) m: the vehicle's nearest point to each place."""
     along, across = _own_frame(mover, place)
     along, across = jnp.clip(along, -mover.half[0], mover.half[0]), jnp.clip(across, -mover.half[1], mover.half[1])
