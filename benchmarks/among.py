@@ -86,6 +86,8 @@ class Options:
     """Other fields of the task."""
     change: tuple[str, ...] = ()
     """Other settings of PPO."""
+    safety: str = "monitor"
+    """As of the training command; "none" where nothing scans."""
     seed: Annotated[int, SEED] = JUDGED
     """Of the worlds of the test."""
     results: Path = RESULTS
@@ -103,6 +105,7 @@ def preset_of(options: Options, senses: str, seed: int, folder: Path) -> tuple[T
     asked = TrainOptions(
         out=folder, vehicle=Path(VEHICLE), task="among_people", preset="wallclock", learner="ppo", seed=seed,
         set=(f"map={maps}", f"senses={senses}", *options.set), change=options.change, instances=options.instances,
+        safety="none" if senses == "camera" else options.safety,
     )  # fmt: skip
     return asked, choose_preset(asked)
 
@@ -146,7 +149,7 @@ def shares(metrics: dict[str, Any]) -> dict[str, float]:
 
 def judged_driver(preset: Preset, course: Course, params: Any) -> tuple[Driver, Any]:
     """The policy, and its first memory, whose number of a sight says what it is shown: one program judges them all."""
-    step, carry = ppo_policy(preset, course.env.model.config.control_dt, course.env)
+    step, carry = ppo_policy(preset, course.env)
     readings = {name: sensor.reading(course.env) for name, sensor in course.env.sensors}
     empty: dict[str, jax.Array] = {name: jnp.zeros(one.shape, one.dtype) for name, one in readings.items()}
     unseen: dict[str, jax.Array] = {}

@@ -134,7 +134,7 @@ def test_the_surprise_of_a_policy_with_several_sensors_is_of_the_goal_that_it_be
     place = vector_size({name: one for name, one in shape.items() if name < TRUTH})
     bias = jnp.zeros_like(out["b"]).at[place : place + 4].set(jnp.log1p(jnp.array([40.0, 10.0, 3.0, 2.0])))
     params["dec"]["vector"]["out"] = {"w": jnp.zeros_like(out["w"]), "b": bias}
-    step, carry = dreamer_policy(preset, 0.1, env)
+    step, carry = dreamer_policy(preset, env)
     obs = {name: jnp.zeros(one, jnp.uint8 if len(one) == 3 else jnp.float32)
            for name, one in shape.items() if name != TRUTH}  # fmt: skip
     carry, _ = step(params, carry, obs)

@@ -27,9 +27,9 @@ from whill_mjx.io.folders import FolderRefused
 from whill_mjx.learning.checks import Stopper, keep_best, read_best
 from whill_mjx.learning.options import TrainOptions, choose_preset
 from whill_mjx.learning.setup import find_preset, functional_env, make_evaluation_env, with_repeat
-from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limit_action, limited_policy, penalty
+from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limited_policy, limiter_of, penalty
 from whill_mjx.learning.trainings import Trained, best_params
-from whill_mjx.tasks.tasks import Corridor, ObstacleCourse, make_task
+from whill_mjx.tasks.tasks import ObstacleCourse, make_task
 from whill_mjx.train import begin, main
 from whill_mjx.vehicle.specs import WHILL_CR
 
@@ -115,16 +115,16 @@ def test_the_exported_policy_keeps_to_the_limits_of_its_training_by_itself(run):
 
 @pytest.mark.quick
 def test_limited_actions_stay_within_reach_and_no_limit_changes_nothing():
-    task, gentle = Corridor(), Safety(acceleration=0.5, yaw_acceleration=1.0)
-    from_rest = limit_action(task, gentle, jnp.array([1.0, -1.0]), jnp.zeros(2), 0.1)
+    env, _ = make_env("corridor")
+    gentle = limiter_of(Safety(acceleration=0.5, yaw_acceleration=1.0), env)
+    from_rest, _ = gentle.limited(jnp.array([1.0, -1.0]), jnp.zeros(2), None, {})
     np.testing.assert_allclose(from_rest, [2 * 0.05 / 0.3 - 1, -0.1 / 0.6], atol=1e-6)
-    free = limit_action(task, Safety(), jnp.array([0.3, -0.7]), jnp.zeros(2), 0.1)
-    np.testing.assert_allclose(free, [0.3, -0.7], atol=1e-6)
-    step, carry = limited_policy(task, Safety(), len, {}, 0.1)
+    assert limiter_of(Safety(), env) is None
+    step, carry = limited_policy(None, len, {})
     assert step is len and carry == {}
     with pytest.raises(ValueError, match="must not be negative"):
         Safety(clearance_gain=-1.0)
-    with pytest.raises(ValueError, match="known: none, smooth, safe"):
+    with pytest.raises(ValueError, match="known: none, smooth, safe, monitor"):
         find_safety("bold")
 
 

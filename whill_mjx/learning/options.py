@@ -86,7 +86,8 @@ class TrainOptions:
     instances: Annotated[int | None, Range(1, 10**7)] = None
     """Chairs side by side; none takes the preset's."""
     safety: str = "none"
-    """none (the task's reward alone), smooth (gentle commands) or safe (gentle commands and a distance kept)."""
+    """none (the task's reward alone), smooth (gentle commands), safe (gentle commands and a distance kept) or monitor
+    (slower before what the scanners see: a collision monitor in the policy itself)."""
     stop_success: Annotated[float | None, SHARE] = None
     """End when two evaluations inside the run in a row reach this share of successes. A file RUN/stop ends it too."""
     export: Annotated[Literal["last", "best"], MODEL] = "best"

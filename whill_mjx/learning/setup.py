@@ -25,7 +25,7 @@ from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.novelty import watched
 from whill_mjx.learning import ppo
 from whill_mjx.learning.ppo import PpoConfig
-from whill_mjx.learning.shaping import Safety, Step, limit_action, limited_policy, penalty
+from whill_mjx.learning.shaping import Safety, Step, limited_policy, limiter_of, penalty
 from whill_mjx.sensors import privileged
 from whill_mjx.sensors.camera import is_aside
 from whill_mjx.tasks.tasks import Budget, Task, make_task
@@ -279,8 +279,14 @@ def functional_env(
         safety: limits the commands and, if `shaped`, takes its penalties off the reward; None asks nothing.
         shaped: False leaves the reward the task's own, as evaluations must.
         targets: show what only the simulator knows too, as TRUTH beside "camera"; it is no input of a policy.
+
+    Raises:
+        ValueError: a collision monitor is asked for, and nothing scans.
     """
     safety = safety or Safety()
+    limiter = limiter_of(safety, batch.env)
+    memory = jax.tree.map(lambda one: jnp.tile(one, (batch.count, 1)), limiter.memory() if limiter else {})
+    monitored = bool(memory)  # then what was seen last, and before that, is part of the state
     task = batch.env.task
     seconds = batch.env.model.config.control_dt * task.action_repeat
 
@@ -294,12 +300,13 @@ def functional_env(
 
     def reset(key: jax.Array) -> tuple[Any, Transition]:
         state, step = batch.reset(key)
-        return state, emit(state, step)
+        return (state, step.obs, memory) if monitored else state, emit(state, step)
 
     def step(state: Any, action: jax.Array) -> tuple[Any, Transition]:
+        state, seen, scans = state if monitored else (state, None, memory)
         before = state.env.command
-        if safety.limits:
-            action = jax.vmap(lambda a, b: limit_action(task, safety, a, b, seconds))(action, before)
+        if limiter is not None:
+            action, scans = jax.vmap(limiter.limited)(action, before, seen, scans)
         state, step = batch.step(state, action)
         if shaped and (safety.clearance_gain or safety.change_gain):
             span = jnp.array([task.v_max - task.v_min, 2.0 * task.omega_max]) / 2.0
@@ -307,6 +314,9 @@ def functional_env(
             near = step.metrics["clearance"]
             lost = jax.vmap(lambda distance, moved: penalty(safety, distance, moved, seconds))(near, change)
             step = dataclasses.replace(step, reward=step.reward - jnp.where(step.first, 0.0, lost))
+        if monitored:
+            scans = jax.tree.map(lambda one: jnp.where(step.first[:, None], 0.0, one), scans)
+            return (state, step.obs, scans), emit(state, step)
         return state, emit(state, step)
 
     shape = with_truth(obs_shape_of(batch.env)) if targets else obs_shape_of(batch.env)
@@ -439,9 +449,9 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
     return tuple(found)
 
 
-def dreamer_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
+def dreamer_policy(preset: Preset, env: Env) -> tuple[Step, dict[str, Any]]:
     """The agent as the step of one instance, limits included, and its first carry; for what `env` shows."""
-    learner, seconds = preset.learner, control_dt * preset.task.action_repeat
+    learner, seconds = preset.learner, env.model.config.control_dt * preset.task.action_repeat
     step: Step = lambda params, carry, image: agents.policy_step(learner, params, carry, image)  # noqa: E731
     carry = agents.policy_carry(learner, 2)
     if env.rich and TRUTH in learner.decode_only:
@@ -451,15 +461,13 @@ def dreamer_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, d
             return privileged.UNIT * agents.believed(params, carry, shape, TRUTH)[..., :4]
 
         step, carry = watched(step, carry, seconds, believe)
-    return limited_policy(preset.task, preset.safety, step, carry, seconds)
+    return limited_policy(limiter_of(preset.safety, env), step, carry)
 
 
-def ppo_policy(preset: Preset, control_dt: float, env: Env) -> tuple[Step, dict[str, Any]]:
+def ppo_policy(preset: Preset, env: Env) -> tuple[Step, dict[str, Any]]:
     """The same of the model-free baseline."""
-    return limited_policy(
-        preset.task, preset.safety, lambda params, carry, image: ppo.policy_step(preset.ppo, params, carry, image),
-        ppo.policy_carry(preset.ppo, obs_shape_of(env)), control_dt * preset.task.action_repeat,
-    )  # fmt: skip
+    step: Step = lambda params, carry, seen: ppo.policy_step(preset.ppo, params, carry, seen)  # noqa: E731
+    return limited_policy(limiter_of(preset.safety, env), step, ppo.policy_carry(preset.ppo, obs_shape_of(env)))
 
 
 def step_driver(step: Step, weights: Any, carry: dict[str, Any], period: int) -> Driver:

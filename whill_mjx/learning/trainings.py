@@ -136,7 +136,4 @@ def make_course(preset: Preset, vehicle: Path) -> Course:
 
 def policy_of(options: TrainOptions, preset: Preset, course: Course) -> tuple[Step, dict[str, Any]]:
     """What drives, and is exported: the step of one instance and its first carry."""
-    control_dt = course.env.model.config.control_dt
-    if options.learner == "ppo":
-        return ppo_policy(preset, control_dt, course.env)
-    return dreamer_policy(preset, control_dt, course.env)
+    return (ppo_policy if options.learner == "ppo" else dreamer_policy)(preset, course.env)

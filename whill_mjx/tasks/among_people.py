@@ -20,6 +20,8 @@ from whill_mjx.tasks.map_goal import MapGoal
 from whill_mjx.tasks.terms import Moment
 
 SENSES = ("camera", "lidar", "both")
+CHEST = 1.1
+"""Height of the scanner [m]: of people it sees the trunk, which is wider than legs and does not swing."""
 
 
 @dataclass(frozen=True)
@@ -69,5 +71,5 @@ class AmongPeople(MapGoal):
         if self.senses != "lidar":
             seen["camera"] = Camera()
         if self.senses != "camera":
-            seen["lidar"] = Lidar(rays=180, reach=8.0, z=0.3, noise=0.01, dropouts=0.01)
+            seen["lidar"] = Lidar(rays=180, reach=8.0, z=CHEST, noise=0.01, dropouts=0.01)
         return seen
