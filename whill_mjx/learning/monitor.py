@@ -58,10 +58,10 @@ class Monitor:
         """The nearest to the command (2,) of: the same curve more slowly; straight on; a turn on the spot. And the
         memory after it.
 
-        A thing lies on the way where the vehicle would meet it within twice the `time`. The vehicle's border may near
-        such a thing, at distance d, by (d - margin) / time. Where something comes with speed w, wherever it is, the
-        vehicle slows down to (d - margin) / (w time) of the command: it stands before it is touched. It recovers from
-        that within the `time`.
+        A thing lies on the way where the vehicle would meet it within twice the `time`, if both went on like this. The
+        vehicle's border may near such a thing, at distance d and coming with speed w, by (d - margin) / time - w.
+        Where something comes, wherever it is, the command is eased to (d - margin) / (w time) of it, so that the
+        vehicle stands before it is touched. From that it recovers within the `time`.
 
         Args:
             command: (2,) speed [m/s] and yaw rate [rad/s] that are wanted.
@@ -75,7 +75,7 @@ class Monitor:
         slowed = jnp.maximum(1.0 - self._time_left(points, comes), memory[SLOWED][0] - self.seconds / self.time)
         eased = (1.0 - slowed) * command
         ways = eased * jnp.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
-        allowed = jax.vmap(lambda way: way * self._share(way, points))(ways)
+        allowed = jax.vmap(lambda way: way * self._share(way, points, comes))(ways)
         lost = jnp.sum(((allowed - eased) * jnp.array([1.0, self.half_length])) ** 2, -1)
         after = {**{name: seen[name] for name, _ in self.scanners}, SLOWED: slowed[None]}
         other = jnp.where(lost[1] <= lost[2], allowed[1], allowed[2])
@@ -96,15 +96,15 @@ class Monitor:
         left = (apart - self.margin) / (self.time * jnp.maximum(toward, 1e-6))
         return jnp.clip(jnp.min(jnp.where(toward > SLOWEST, left, 1.0)), 0.0, 1.0)
 
-    def _share(self, command: jax.Array, points: jax.Array) -> jax.Array:
-        """() of a command (2,) that is left before points (N, 2) [m] that stand."""
+    def _share(self, command: jax.Array, points: jax.Array, comes: jax.Array) -> jax.Array:
+        """() of a command (2,) that is left before points (N, 2) [m] with velocities (N, 2) [m/s]."""
         border, away = self._apart(points)
         apart = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
         arm = border - jnp.array([self.turns_at, 0.0])
         speed = jnp.stack([command[0] - command[1] * arm[:, 1], command[1] * arm[:, 0]], -1)
-        nears = jnp.sum(speed * away, -1) / apart
-        allowed = jnp.maximum((apart - self.margin) / self.time, 0.0)
-        slower = self._on_the_way(command, points) & (nears > allowed)
+        nears, toward = jnp.sum(speed * away, -1) / apart, -jnp.sum(comes * away, -1) / apart
+        allowed = jnp.maximum((apart - self.margin) / self.time - jnp.maximum(toward, 0.0), 0.0)
+        slower = self._on_the_way(command, points, comes) & (nears > allowed)
         return jnp.min(jnp.where(slower, allowed / jnp.maximum(nears, 1e-6), 1.0))
 
     def _points(self, scanner: Lidar, distances: jax.Array, before: jax.Array,
@@ -125,13 +125,13 @@ class Monitor:
         speed = jnp.clip(came / self.seconds, 0.0, FASTEST)
         return points, -speed[:, None] * ways
 
-    def _on_the_way(self, command: jax.Array, points: jax.Array) -> jax.Array:
-        """(N,) bool: whether the vehicle would meet each point (N, 2) if it went on like this."""
+    def _on_the_way(self, command: jax.Array, points: jax.Array, comes: jax.Array) -> jax.Array:
+        """(N,) bool: whether the vehicle would meet each point (N, 2) if both went on like this."""
         half = jnp.array([self.half_length, self.half_width])
         axle = jnp.array([self.turns_at, 0.0])
         met = []
         for time in np.arange(1, POSES + 1) * (2.0 * self.time / POSES):
-            there = axle + _turned(points - axle - _chord(command, time), -command[1] * time)
+            there = axle + _turned(points + time * comes - axle - _chord(command, time), -command[1] * time)
             met.append((jnp.abs(there) < half + SIDE).all(-1))
         return jnp.stack(met).any(0)
 
