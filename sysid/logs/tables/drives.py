@@ -151,11 +151,10 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     if begin >= end:
         spans = "; ".join(f"{key} {one[0, 0]:.3f} to {one[-1, 0]:.3f} s" for key, one in made.items())
         raise ValueError(f"{source}: the streams of {name} share no time ({spans}). Put them on one clock first.")
-    unused = _left_over(tables, columns)
     turns = [float(np.ptp(made[one][:, 3])) for one in ("odometry", "ground_truth") if one in made]
     if not {"omega", "left"} & set(streams.get("command", {"omega"})) and min(turns) > TURNED:
-        raise ValueError(f"{source}: {name}: {without_yaw_rate(min(turns), unused)}")
-    if unused:
+        raise ValueError(f"{source}: {name}: {without_yaw_rate(min(turns), _left_over(tables, columns))}")
+    if unused := _left_over(tables, columns):
         notes.append(f"not used: {first_of(unused)}")
     notes = list(dict.fromkeys(note.removeprefix(f"{name}: ") for note in notes))
     return TextDrive(name, made, tuple(columns), tuple(notes), measured_input)
