@@ -142,6 +142,14 @@ def test_a_trial_in_which_the_vehicle_stands_is_left_out_and_a_dead_zone_is_not(
     assert without_standing(log_of(*moving, held), "odd").trials[-1] is held
 
 
+def test_a_driver_that_leaves_its_speeds_at_zero_is_no_emergency_stop():
+    moving = drive("m_1")
+    empty = replace(moving, ground_truth=None, odometry=replace(moving.odometry, v=0 * moving.odometry.v,
+                                                                omega=0 * moving.odometry.omega))
+    assert stood([empty], 0.25) == []
+    assert any("the driver does not fill the twist" in one for one in sanity(log_of(empty)))
+
+
 def test_a_log_in_which_the_vehicle_never_moves_is_refused():
     with pytest.raises(ValueError, match="stands in all training trials"):
         without_standing(log_of(drive("a", gain=0.0), drive("b", seed=1, gain=0.0)), "odd")
