@@ -286,6 +286,19 @@ def test_of_two_clocks_that_come_apart_the_faster_ones_gain_shows_no_unit(name):
     assert re.match("(ground_truth|odometry): its clock runs", said)
 
 
+@pytest.mark.parametrize("pose", [True, False])
+def test_a_speed_without_a_sign_is_named(pose):
+    t = np.arange(0.0, 40.0, 0.05)
+    sent = np.select([t < 2, t < 30, t < 34], [0.0, 0.5, -0.3], 0.0)
+    v, omega = np.interp(t - 0.2, t, sent), np.interp(t - 0.2, t, 0.4 * (t > 3))
+    size = np.abs(v)
+    places = integrate_speeds(t, v if pose else size, omega)
+    trial = Trial("a_1", "a", Command(t, sent, 0.4 * (t > 3)), OdometryStream(t, *places, size, omega), None, Start())
+    assert any("v is never negative" in one for one in sanity(log_of(trial)))
+    forward = replace(trial, odometry=replace(trial.odometry, v=np.maximum(v, 0.0)))  # it has no reverse
+    assert not any("v is never negative" in one for one in sanity(log_of(forward)))
+
+
 def test_a_wheel_that_sticks_and_slips_is_no_empty_twist():
     t = np.arange(0.0, 6.0, 0.02)
     omega = np.where((t % 0.3 < 0.1) & (t > 1), 2.0, 0.0)
