@@ -51,6 +51,7 @@ TURNS, ROWS = 0.5, 100  # share of the squared steps from row to row, and rows t
 """Squared steps over two rows, below which rows take turns: of noise alone they are as large, of motion larger."""
 HELD = 0.5  # s for which rows repeat before a jump when a driver was held up
 FROZEN = 1.0  # s for which rows repeat that is longer than a driver takes between two updates
+FOLLOWS = 0.5  # share of a commanded speed at which a vehicle moves
 STILL = 1e-3  # m/s and rad/s below which a speed is none
 MOVED = 0.5  # m and rad that a vehicle goes and turns by when each of its columns must change
 
@@ -73,7 +74,7 @@ def contradictions(trials: Sequence[Trial], reach: float = 1.0) -> dict[str, lis
 
 
 def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) -> list[str]:
-    empty = _empty_speeds(trials) if name == "odometry" else []
+    empty = [*_empty_speeds(trials), *_without_sign(trials)] if name == "odometry" else []
     if found := (constant_columns(name, trials) or frozen(name, trials) or two_sources(name, trials)
                  or [*jumps(name, trials), *empty]):
         return found
@@ -264,6 +265,20 @@ def _empty_shares(trial: Trial) -> tuple[float, float] | None:
         silent = (moved[last] == moved[first])[faster]
         shares.append(float(silent.mean()) if faster.sum() > 10 else float("nan"))
     return shares[0], shares[1]
+
+
+def _without_sign(trials: Sequence[Trial]) -> list[str]:
+    """A sentence on a speed of the odometry that is never negative, though the vehicle moves when it is sent back."""
+    streams = [(trial, trial.odometry) for trial in trials if trial.odometry is not None]
+    if not streams or any((stream.v < 0).any() for _, stream in streams):
+        return []
+    sent = np.concatenate([trial.command.at(stream.t - RESPONSE, (0.0, 0.0))[0] for trial, stream in streams])
+    back = sent < -MOVING
+    v = np.concatenate([stream.v for _, stream in streams])
+    if back.sum() <= 10 or float(np.median(v[back] / -sent[back])) < FOLLOWS:
+        return []
+    return ["odometry: v is never negative, though the vehicle moves when it is sent backwards: it is the size of the "
+            "speed alone. Record the speed along the vehicle's x axis, or give v the sign of the motion."]
 
 
 def jumps(name: str, trials: Sequence[Trial]) -> list[str]:

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.logs.records import Log, Trial
+from sysid.logs.records import Log, Trial, logged_pose
 from sysid.logs.streams import added_up, speeds
 
 LOST = 0.5  # yaw [rad] by which the outside pose may part from the rate: at 3 m/s it is off by 1.5 m a second later
@@ -87,10 +87,11 @@ def stood(trials: Sequence[Trial], reach: float) -> list[str]:
 
 
 def sizes_of(trial: Trial, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Commanded and measured speeds (T,) [m/s], of odometry or outside pose, whichever moves more, or empty."""
+    """Commanded and measured speeds (T,) [m/s], of odometry, its pose or outside pose: what moves most, or empty."""
     found = []
-    for channel in ("odometry", "ground_truth"):
-        rates = speeds(trial, channel)
+    by_its_pose = replace(trial, ground_truth=logged_pose(trial.odometry))  # a driver may leave the speeds at zero
+    for one, channel in ((trial, "odometry"), (trial, "ground_truth"), (by_its_pose, "ground_truth")):
+        rates = speeds(one, channel)
         if rates is not None:
             v, omega = trial.command.at(rates[0] - RESPONSE, (0.0, 0.0))
             found.append((np.hypot(v, reach * omega), np.hypot(rates[1], reach * rates[2])))

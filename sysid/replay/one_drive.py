@@ -16,6 +16,7 @@ from sysid.replay import pieces
 from sysid.replay.cores import on_processor
 from sysid.replay.delays import delay_apart, delayed, framed, late, reached, without
 from sysid.replay.records import ODOMETRY, POSE, SPEEDS, TURN, YAW_COLUMNS, Batch, Plant, Simulated
+from whill_mjx.effects.base import act
 from whill_mjx.effects.odometry_lag import OdometryLag
 from whill_mjx.effects.sensor_delay import SensorDelay
 from whill_mjx.processor import as_one_function
@@ -80,7 +81,7 @@ def as_sensed(plant: Plant, params: Any, commanded: Commanded, path: jax.Array, 
         path = path.at[:, ODOMETRY].set(late(path[:, ODOMETRY], latency, gap))
     for effect in getattr(params, "effects", ()):
         if hasattr(effect, "outside"):
-            path = path.at[:, POSE].set(effect.outside((), path[:, POSE], gap)[1])
+            path = path.at[:, POSE].set(act(effect, "outside", (), path[:, POSE], gap)[1])
     # The measured yaw may count full turns from another origin than the simulated one.
     path = path.at[:, 2].add(turns)
     return jnp.concatenate([path, turned[:, None]], axis=1) if gyro else path

@@ -106,10 +106,9 @@ def write_bag(folder, storage=StoragePlugin.SQLITE3, topics=(COMMAND, ODOMETRY, 
     if edit:
         rows = edit(rows)
     with Writer(folder, version=9, storage_plugin=storage) as writer:
-        connections = {topic: writer.add_connection(topic, kind, typestore=STORE)
-                       for topic, kind in {(row[1], row[2]) for row in rows}}
+        connections = {one: writer.add_connection(*one, typestore=STORE) for one in {(row[1], row[2]) for row in rows}}
         for t, topic, kind, content in rows:
-            writer.write(connections[topic], int(round((T0 + t) * 1e9)), STORE.serialize_cdr(content, kind))
+            writer.write(connections[topic, kind], int(round((T0 + t) * 1e9)), STORE.serialize_cdr(content, kind))
     return folder
 
 
@@ -133,6 +132,16 @@ def test_topics_that_may_be_meant_are_asked_for_and_speeds_to_the_side_are_named
         convert(ConvertConfig(bag, tmp_path / "data"))
     _, notes = convert(ConvertConfig(bag, tmp_path / "data", command_topic="/joy/cmd_vel"))
     assert any("up to 0.3 m/s sideways" in note for note in notes)
+
+
+def test_a_topic_of_two_types_is_named_with_both(tmp_path):
+    def both(rows):
+        kind = "geometry_msgs/msg/TwistStamped"
+        return rows + [(t, topic, kind, message(kind, header=header(T0 + t), twist=content))
+                       for t, topic, _, content in rows if topic == COMMAND]
+
+    with pytest.raises(ValueError, match=f"{COMMAND} has messages of Twist and TwistStamped, .*--command-topic"):
+        convert(ConvertConfig(write_bag(tmp_path / "bag", edit=both), tmp_path / "data"))
 
 
 @pytest.mark.parametrize("topic", [ODOMETRY, TRUTH])

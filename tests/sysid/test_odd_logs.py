@@ -142,6 +142,14 @@ def test_a_trial_in_which_the_vehicle_stands_is_left_out_and_a_dead_zone_is_not(
     assert without_standing(log_of(*moving, held), "odd").trials[-1] is held
 
 
+def test_a_driver_that_leaves_its_speeds_at_zero_is_no_emergency_stop():
+    moving = drive("m_1")
+    empty = replace(moving, ground_truth=None, odometry=replace(moving.odometry, v=0 * moving.odometry.v,
+                                                                omega=0 * moving.odometry.omega))
+    assert stood([empty], 0.25) == []
+    assert any("the driver does not fill the twist" in one for one in sanity(log_of(empty)))
+
+
 def test_a_log_in_which_the_vehicle_never_moves_is_refused():
     with pytest.raises(ValueError, match="stands in all training trials"):
         without_standing(log_of(drive("a", gain=0.0), drive("b", seed=1, gain=0.0)), "odd")
@@ -276,6 +284,19 @@ def test_of_two_clocks_that_come_apart_the_faster_ones_gain_shows_no_unit(name):
     assert sanity(log_of(*trials)) == []
     (said,) = sanity(log_of(*fast))
     assert re.match("(ground_truth|odometry): its clock runs", said)
+
+
+@pytest.mark.parametrize("pose", [True, False])
+def test_a_speed_without_a_sign_is_named(pose):
+    t = np.arange(0.0, 40.0, 0.05)
+    sent = np.select([t < 2, t < 30, t < 34], [0.0, 0.5, -0.3], 0.0)
+    v, omega = np.interp(t - 0.2, t, sent), np.interp(t - 0.2, t, 0.4 * (t > 3))
+    size = np.abs(v)
+    places = integrate_speeds(t, v if pose else size, omega)
+    trial = Trial("a_1", "a", Command(t, sent, 0.4 * (t > 3)), OdometryStream(t, *places, size, omega), None, Start())
+    assert any("v is never negative" in one for one in sanity(log_of(trial)))
+    forward = replace(trial, odometry=replace(trial.odometry, v=np.maximum(v, 0.0)))  # it has no reverse
+    assert not any("v is never negative" in one for one in sanity(log_of(forward)))
 
 
 def test_a_wheel_that_sticks_and_slips_is_no_empty_twist():

@@ -114,6 +114,45 @@ def test_a_vehicle_that_turns_without_a_commanded_yaw_rate_is_refused_with_the_u
     assert np.ptp(load_log(tmp_path / "data").trials[0].command.omega) > 0.5
 
 
+@pytest.mark.parametrize("measured", ["speeds", "wheels"])
+def test_a_vehicle_whose_speeds_alone_show_that_it_turns_needs_a_commanded_yaw_rate(tmp_path, measured):
+    c = columns()
+    speeds = {"odom_v": c["v"], "odom_w": c["w"]} if measured == "speeds" else {
+        "left_rad_s": (c["v"] - 0.248 * c["w"]) / 0.1325, "right_rad_s": (c["v"] + 0.248 * c["w"]) / 0.1325}
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "target_speed": c["cv"], "target_steer": np.arctan(c["cw"]),
+                                          **speeds})
+    with pytest.raises(ValueError, match="no column is the commanded yaw rate, .*not used: drive/target_steer"):
+        convert(ConvertConfig(path, tmp_path / "data"))
+
+
+def test_a_command_of_which_only_the_part_that_changed_was_written_keeps_the_other_part(tmp_path):
+    c = columns()
+    changed = {key: np.diff(c[key], prepend=np.nan) != 0 for key in ("cv", "cw")}
+    path = write(tmp_path / "drive.csv", {"t": c["t"], **{f"cmd_{key[1]}": np.where(at, c[key], np.nan)
+                                                          for key, at in changed.items()},
+                                          "odom_v": c["v"], "odom_w": c["w"]})
+    log, _ = convert(ConvertConfig(path, tmp_path / "data"))
+    command = log.trials[0].command
+    np.testing.assert_allclose(command.at(c["t"][1:]), [c["cv"][1:], c["cw"][1:]], atol=1e-5)
+    assert len(command.t) == (changed["cv"] | changed["cw"]).sum()  # rows without a command are none
+
+
+def test_of_two_columns_that_may_be_one_quantity_the_better_named_counts_and_equals_are_asked_for(tmp_path):
+    c = columns()
+    table = {"t": c["t"], "cmd_v": c["cv"], "cmd_w": c["cw"], "gyro_z": 1.2 * c["w"], "odom_v": c["v"],
+             "odom_w": c["w"]}
+    log, _ = convert(ConvertConfig(write(tmp_path / "drive.csv", table), tmp_path / "data"))
+    check(log.trials[0], pose=False)
+    twice = {**table, "odom_v_kmh": 3.6 * c["v"], "joy_v": 0 * c["cv"]}
+    convert(ConvertConfig(write(tmp_path / "drive.csv", twice), tmp_path / "twice"))
+    path = write(tmp_path / "drive.csv", {"t": c["t"], "joy_v": 1.3 * c["cv"], **table})
+    with pytest.raises(ValueError, match="drive/joy_v and drive/cmd_v may both be command.v, and they differ. Say which"
+                                         " is: command.v=COLUMN"):
+        convert(ConvertConfig(path, tmp_path / "asked"))
+    log, _ = convert(ConvertConfig(path, tmp_path / "asked", columns=("command.v=cmd_v",)))
+    check(log.trials[0], pose=False)
+
+
 def test_a_straight_drive_needs_no_commanded_yaw_rate(tmp_path):
     table = without_units(columns(CHAIR["straight_1"]))
     del table["cmd_w"]

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effects_in_hand import run, yielding
+from flax import struct
 
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.effects.acceleration_limit import AccelerationLimit
 from whill_mjx.effects.air_drag import AirDrag
-from whill_mjx.effects.base import PLACES, place_of
+from whill_mjx.effects.base import PLACES, Effect, apply_chain, place_of
 from whill_mjx.effects.command_delay import CommandDelay
 from whill_mjx.effects.lateral_damping import LateralDamping
 from whill_mjx.effects.odometry_lag import OdometryLag
@@ -23,7 +24,7 @@ from whill_mjx.effects.planar import spin_response
 from whill_mjx.effects.rolling_resistance import RollingResistance
 from whill_mjx.effects.slip_traction import SlipTraction
 from whill_mjx.effects.yaw_scrub import YawScrub
-from whill_mjx.vehicle.types import Drive, Odometry, parameters_of
+from whill_mjx.vehicle.types import Drive, Odometry, parameter, parameters_of
 
 DRIVES = {name for name, kind in EFFECTS.items() if kind.card.drives}
 pytestmark = pytest.mark.quick
@@ -208,6 +209,28 @@ def test_an_effect_without_a_place_is_refused():
 
     with pytest.raises(TypeError, match="exactly one of"):
         place_of(Nothing())
+
+
+RETURNS = {
+    "c": ("returns .*Tracer", "the pair .memory, command."),
+    "(memory, c[:1])": ("command is float32 of shape .1,.", "it must be float32 of shape .2,."),
+    "(memory, c.astype(int))": ("command is int32", "it must be float32"),
+    "(c, c)": ("memory is .*Tracer", "it must be tuple"),
+    "(memory, c if c[0] > 0 else -c)": ("TracerBoolConversionError", "jnp.where for if"),
+    "(memory, nothing)": ("command.*: NameError: name 'nothing'", "Correct the method"),
+}
+
+
+@pytest.mark.parametrize("returned", RETURNS)
+def test_an_effect_of_ones_own_that_returns_what_no_vehicle_takes_is_named_with_the_rule(returned):
+    """A command of one number would be taken for both, and one of whole numbers would be cut."""
+    method = eval(f"lambda self, memory, c, motion: {returned}")
+    kind = struct.dataclass(type("Mine", (Effect,), {
+        "__annotations__": {"size": jax.Array}, "size": parameter("-", 0.0, 1.0, 0.0, "size"), "name": "mine",
+        "command": method, "__module__": "mine"}))
+    for said in RETURNS[returned]:
+        with pytest.raises(ValueError, match=f"effect 'mine': .*(?:{said})"):
+            jax.eval_shape(lambda c: apply_chain((kind(0.1),), ((),), "command", c, None)[1], jnp.ones(2))
 
 
 @pytest.mark.parametrize("name", sorted(set(EFFECTS) - DRIVES))

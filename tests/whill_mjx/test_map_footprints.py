@@ -299,6 +299,23 @@ def test_pieces_of_a_relation_and_deleted_ways_are_no_buildings_left_out(tmp_pat
     assert len(load(tmp_path, text).notes) == 1  # how degrees became metres
 
 
+@pytest.mark.parametrize(("attribute", "tag", "there"), [
+    ('action="delete"', "", False), ('action="modify"', "", True), ('visible="false"', "", False),
+    ("", '<tag k="min_height" v="5"/>', False), ("", '<tag k="min_height" v="4.5 m"/>', False),
+    ("", '<tag k="min_height" v="16\'5&quot;"/>', False), ("", '<tag k="min_height" v="1"/>', True),
+    ("", '<tag k="min_height" v="low"/>', True), ("", '<tag k="building:min_level" v="2"/>', False),
+    ("", '<tag k="building:min_level" v="0"/>', True),
+])  # fmt: skip
+def test_what_an_editor_deleted_and_what_a_vehicle_passes_below_is_no_building(tmp_path, attribute, tag, there):
+    corners = "".join(f'<nd ref="{node}"/>' for node in (11, 12, 13, 14, 11))
+    way = f'<way id="9" {attribute}>{corners}<tag k="building" v="yes"/>{tag}</way>'
+    grid = load(tmp_path, town([("outer", 4)], [4]).replace("<relation", f"{way}<relation"))
+    assert area(grid) == pytest.approx(20.1 * 10.1 + (10.1**2 if there else 0.0), abs=4.5)
+    relation = town([("outer", 4)], [4]).replace('<relation id="77"', f'{way}<relation id="77" action="delete"')
+    if there:
+        assert area(load(tmp_path, relation)) == pytest.approx(10.1**2, abs=4.5)
+
+
 def test_a_border_that_lacks_corners_is_drawn_without_them_and_named(tmp_path):
     text = town([("outer", 1), ("outer", 2)], [1, 2, 5])
     own = '<way id="8"><nd ref="11"/><nd ref="12"/><nd ref="13"/><nd ref="14"/><nd ref="11"/>'

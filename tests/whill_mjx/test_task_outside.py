@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.env import make_env, reset_state, step_state, view_of
+from whill_mjx.env import make_env, reset, reset_state, step, step_state, view_of
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.registry import Registry
 from whill_mjx.learning.setup import find_preset
@@ -236,6 +236,24 @@ def test_a_reward_that_is_no_number_ends_the_episode_as_diverged_and_counts_noth
     state = jax.jit(lambda key: reset_state(env, params, key))(jax.random.key(0))
     _, outcome = jax.jit(lambda state: step_state(env, params, state, jnp.zeros(2)))(state)
     assert outcome.reward == 0 and outcome.terminated and outcome.metrics["diverged"] == 1
+
+
+@pytest.mark.quick
+def test_a_reading_that_is_no_number_is_shown_as_0_and_ends_the_episode_and_none_leaves_its_bounds():
+    def own(reading, measure):
+        found = {"Sensor": Sensor, "Reading": Reading, "dataclass": dataclass, "jnp": jnp, "__name__": "mine"}
+        exec(SENSOR.format(reading=f"return {reading}", measure=f"return memory, {measure}"), found)
+        return found["Own"]()
+
+    for measure, ends in (("jnp.stack([v.time_s, 0 / (v.time_s * 0)])", 1.0), ("jnp.stack([v.time_s, v.time_s])", 0.0)):
+        measure = measure.replace("v.", "view.moment.")
+        sensors = {"s": own("Reading((2,))", measure), "c": own("Reading((1,), 0, 1)", "jnp.array([7.0])"),
+                   "b": own("Reading((2,), 0, 255, 'uint8')", "jnp.array([300, -20])")}
+        env, params = make_env("corridor", observations=sensors)
+        state, first = jax.jit(lambda key, env=env, params=params: reset(env, params, key))(jax.random.key(0))
+        assert np.isfinite(first.obs["s"]).all() and list(first.obs["b"]) == [255, 0] and first.obs["c"] == 1.0
+        _, second = jax.jit(lambda state, env=env, params=params: step(env, params, state, jnp.zeros(2)))(state)
+        assert second.metrics["diverged"] == ends and bool(second.terminated) == bool(ends)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.effects.card import Card
+from whill_mjx.io.registry import failed
 from whill_mjx.vehicle.types import Motion, World, Wrench
 
 TINY = 1e-12  # keeps divisions defined at a step or a width of 0
@@ -68,12 +69,50 @@ def place_of(effect: Effect | type[Effect]) -> str:
     return places[0]
 
 
+def act(effect: Any, place: str, memory: Any, *inputs: Any) -> tuple[Any, Any]:
+    """Memory, and what an effect makes of its inputs.
+
+    ValueError, in one line, where an effect of a user's own fails, or gives something else than its place asks for.
+    That is seen while it is traced, so it costs nothing once compiled.
+    """
+    method = getattr(effect, place)
+    if type(effect).__module__.startswith("whill_mjx."):
+        return method(memory, *inputs)
+    what = f"effect {effect.name!r}"
+    try:
+        found = method(memory, *inputs)
+    except (Exception, SystemExit) as error:
+        raise failed(what, type(effect), place, error) from error
+    if not isinstance(found, tuple) or len(found) != 2:
+        raise ValueError(f"{what}: {place} returns {type(found).__name__}; it must be the pair (memory, {place}). "
+                         "Correct the method.")
+    wanted = Wrench.zero() if place == "force" else inputs[0]
+    other = _difference("memory", found[0], memory) or (  # surfaces add to the ground of a world
+        "" if place == "world" else _difference(place, found[1], wanted))
+    if other:
+        raise ValueError(f"{what}: of the pair (memory, {place}) that {place} returns, {other}. Correct the method, or "
+                         "the memory of init.")
+    return found
+
+
+def _difference(name: str, given: Any, wanted: Any) -> str:
+    """How a value differs from another in type, in shape or in kind of number; empty where it does not."""
+    if str(jax.tree.structure(given)) != str(jax.tree.structure(wanted)):
+        return f"{name} is {type(given).__name__}; it must be {type(wanted).__name__}, with the same parts"
+    for (way, one), other in zip(jax.tree_util.tree_leaves_with_path(given), jax.tree.leaves(wanted), strict=True):
+        found, needed = ((jnp.result_type(leaf), jnp.shape(leaf)) for leaf in (one, other))
+        if found[1] != needed[1] or found[0].kind != needed[0].kind:
+            return (f"{name}{jax.tree_util.keystr(way)} is {found[0]} of shape {found[1]}; it must be {needed[0]} of "
+                    f"shape {needed[1]}")
+    return ""
+
+
 def apply_chain(effects: tuple, memory: tuple, place: str, value: Any, *context: Any) -> tuple[tuple, Any]:
     """Pass `value` through every effect of `place` in order; returns the new memory and value."""
     memory_list = list(memory)
     for index, effect in enumerate(effects):
         if place_of(effect) == place:
-            memory_list[index], value = getattr(effect, place)(memory_list[index], value, *context)
+            memory_list[index], value = act(effect, place, memory_list[index], value, *context)
     return tuple(memory_list), value
 
 
@@ -83,7 +122,7 @@ def sum_forces(effects: tuple, memory: tuple, motion: Motion, reacts: bool) -> t
     total = Wrench.zero()
     for index, effect in enumerate(effects):
         if place_of(effect) == "force" and effect.reacts == reacts:
-            memory_list[index], wrench = effect.force(memory_list[index], motion)
+            memory_list[index], wrench = act(effect, "force", memory_list[index], motion)
             total = total + wrench
     return tuple(memory_list), total
 

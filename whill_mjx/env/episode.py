@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from whill_mjx.env.images import observe
 from whill_mjx.env.moments import endings_of, event_metrics, first_outcome, moment_of, pose_metrics, view_of
 from whill_mjx.env.records import EVENT_METRICS, TRAIL, Env, Outcome, State
-from whill_mjx.sensors.base import begin_sensors, read_sensors
+from whill_mjx.sensors.base import begin_sensors, read_sensors, without_nan
 from whill_mjx.tasks.base import scale_action
 from whill_mjx.tasks.parts import BLUE
 from whill_mjx.tasks.starts import draw_start
@@ -203,8 +203,9 @@ def _stopped(env: Env, state: State, vehicle: VehicleState) -> tuple[Scene, Vehi
 def sense(env: Env, params: VehicleParams, state: State, seen: State | None = None) -> tuple[State, Any]:
     """State with the memory of the sensors, and what they show: the camera image (H, W, 3) uint8, or a dict by name.
 
-    Called once a step, after the choice between the next state and a new episode. `seen` is the state that cameras look
-    at, where an evaluation has moved them.
+    Called once a step, after the choice between the next state and a new episode. A reading that is no finite number is
+    shown as 0, and ends the episode as `diverged` at the next step. `seen` is the state that cameras look at, where an
+    evaluation has moved them.
     """
     seen = state if seen is None else seen
     if not env.sensors:
@@ -212,4 +213,6 @@ def sense(env: Env, params: VehicleParams, state: State, seen: State | None = No
     key = jax.random.fold_in(state.key, state.step_count)
     view = view_of(env, params, state)
     memory, obs = read_sensors(env.sensors, state.sensors, view, dataclasses.replace(view, state=seen), key)
-    return dataclasses.replace(state, sensors=memory), obs
+    obs, odd = without_nan(env.sensors, obs)
+    vehicle = dataclasses.replace(state.vehicle, diverged=state.vehicle.diverged | odd)
+    return dataclasses.replace(state, sensors=memory, vehicle=vehicle), obs

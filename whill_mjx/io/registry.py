@@ -8,8 +8,10 @@ imported first.
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 import threading
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -113,3 +115,22 @@ def home(thing: Any) -> str:
     """Module and name of a class, or of a value's class."""
     kind = thing if isinstance(thing, type) else type(thing)
     return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def failed(what: str, kind: type, method: str, error: BaseException) -> ValueError:
+    """The error, in one line, of a method of a user's own class that fails while it is traced."""
+    said = str(error).strip().split("\n")[0].rstrip(".")
+    traced = {"ConcretizationTypeError", "TracerArrayConversionError"} & {one.__name__ for one in type(error).__mro__}
+    hint = " (it is traced: jax.numpy for numpy, jnp.where for if)" if traced else ""
+    return ValueError(f"{what}: {method}{_line(kind, error)}: {type(error).__name__}: {said}. Correct the "
+                      f"method{hint}.")
+
+
+def _line(kind: type, error: BaseException) -> str:
+    """Where in the file of a class an error arose."""
+    try:
+        own = inspect.getfile(kind)
+    except (OSError, TypeError):
+        return ""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
+    return f", line {lines[-1]}" if lines else ""

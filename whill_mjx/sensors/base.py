@@ -202,11 +202,39 @@ def _finished(sensor: Sensor, reading: Reading, value: jax.Array, key: jax.Array
         raise ValueError(f"{type(sensor).__name__}: measured {value.shape}, but its reading says {reading.shape}. "
                          "Both must agree.")
     if not sensor.noise or sensor.noisy:
-        return value.astype(reading.dtype)
+        return _bounded(value, reading) if _of_a_user(sensor) else value.astype(reading.dtype)
     value = value.astype(jnp.float32) + sensor.noise * jax.random.normal(key, value.shape)
     if np.issubdtype(reading.dtype, np.integer):
         value = jnp.round(value)
-    return jnp.clip(value, reading.low, reading.high).astype(reading.dtype)
+    return _bounded(value, reading)
+
+
+def _bounded(value: jax.Array, reading: Reading) -> jax.Array:
+    """A value within the bounds of its reading, in its type: a number beyond those of a type would begin anew."""
+    low, high = reading.low, reading.high
+    if np.issubdtype(reading.dtype, np.integer):
+        least = np.iinfo(reading.dtype)
+        low, high = np.maximum(low, least.min), np.minimum(high, least.max)
+    if value.dtype == reading.dtype and not np.isfinite([low, high]).any():
+        return value
+    return jnp.clip(value, low, high).astype(reading.dtype)
+
+
+def without_nan(sensors: Sensors, obs: dict[str, jax.Array]) -> tuple[dict[str, jax.Array], jax.Array]:
+    """Observations with 0 for what sensors of a user's own give as no finite number, and whether there was any ().
+
+    It would stay in a learner for good. The sensors of this package give none.
+    """
+    found, odd = dict(obs), jnp.zeros((), bool)
+    for name, sensor in sensors:
+        if _of_a_user(sensor) and jnp.issubdtype(obs[name].dtype, jnp.floating):
+            finite = jnp.isfinite(obs[name])
+            found[name], odd = jnp.where(finite, obs[name], 0.0), odd | ~finite.all()
+    return found, odd
+
+
+def _of_a_user(sensor: Sensor) -> bool:
+    return not type(sensor).__module__.startswith("whill_mjx.")
 
 
 def _first_line(sensor: Sensor, view: View) -> Line:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import inspect
 import re
-import traceback
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -16,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.io.fields import shown
+from whill_mjx.io.registry import failed
 from whill_mjx.sensors.base import as_sensors
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.base import Budget, Task, World
@@ -144,24 +143,7 @@ def _traced(task: Task, method: str, argument: Any) -> Any:
 
 
 def _failed(task: Task, method: str, error: BaseException) -> ValueError:
-    said = str(error).strip().split("\n")[0].rstrip(".")
-    return ValueError(f"task {task.name!r}: {method}{_line(task, error)}: {type(error).__name__}: {said}. Correct the "
-                      f"method{_hint(error)}.")
-
-
-def _hint(error: BaseException) -> str:
-    traced = isinstance(error, (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError))
-    return " (it is traced: jax.numpy for numpy, jnp.where for if)" if traced else ""
-
-
-def _line(task: Task, error: BaseException) -> str:
-    """Where in the task's own file an error arose."""
-    try:
-        own = inspect.getfile(type(task))
-    except (OSError, TypeError):
-        return ""
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == own]
-    return f", line {lines[-1]}" if lines else ""
+    return failed(f"task {task.name!r}", type(task), method, error)
 
 
 def _wrong(task: Task, method: str, found: str, needed: str) -> ValueError:

@@ -77,6 +77,10 @@ def choose_topics(
                 _check_asked(path, known, stream, topic, types[stream])
                 chosen[stream] = topic
             continue
+        mixed = next((name for name in TOPICS[stream] if " and " in known.get(name, "") and stream in WHAT), "")
+        if mixed:
+            raise ValueError(f"{path}: topic {mixed} has messages of {known[mixed]}, and a vehicle takes one. Copy "
+                             f"one of them to a bag of its own, or name another topic with {OPTIONS[stream]}.")
         usual = [name for name in TOPICS[stream] if short_type(known.get(name, "")) in TYPES[stream]]
         fitting = [name for name, kind in known.items() if short_type(kind) in TYPES[stream]
                    and name not in (*chosen.values(), *asked.values())]

@@ -55,6 +55,11 @@ class Column:
     def __str__(self) -> str:
         return f"{self.role}={self.file}/{self.name}:{'-' if self.sign < 0 else ''}{self.unit}"
 
+    @property
+    def guessed(self) -> bool:
+        """Whether nobody said which role it has."""
+        return bool(self.why) and not self.why.startswith(SAID)
+
     def in_si(self, values: np.ndarray) -> np.ndarray:
         """Its numbers (T,) in SI units."""
         return np.asarray(values * (self.sign * size_of(self.role, self.unit)))

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.logs.tables.columns import ROLES, SAID, Column, Table, is_unit_of, kind_of, unit_of, units_of
+from sysid.logs.tables.columns import ROLES, SAID, Column, Table, is_unit_of, kind_of, size_of, unit_of, units_of
 from sysid.logs.tables.guess import guess
-from sysid.logs.tables.names import COUNTS, TICKS, TIME_WORDS, split_unit
+from sysid.logs.tables.names import COUNTS, TICKS, TIME_WORDS, by_name, says_any_stream, split_unit
 from sysid.logs.tables.sizes import TURNED
 from whill_mjx.io.fields import shown
 
 NAMED = 12  # columns that an error lists
+SAME = 0.02  # of a column's range, within which another one holds the same
 FAR_MORE, STEEP, LEAST_WAY = 3.0, 0.3, 0.3
 """Times the least of x and y, share of the greatest, and m of that at least: no vehicle on a floor rises by as much."""
 
@@ -132,10 +133,7 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         return (f"{found[0].file}/{found[0].name} is the only part of a command: v and omega, or left and right belong "
                 "to it.")
     if {"command.v", "command.omega"} & roles == {"command.v"} and (turn := _turned(columns, arrays)) > TURNED:
-        unused = first_of(unused_columns(tables, columns))
-        return (f"no column is the commanded yaw rate, though the vehicle turns by {turn:.2g} rad: "
-                f"{f'not used: {unused}' if unused else 'all columns are used'}. If none was commanded, add a column "
-                "of zeros for it.")
+        return without_yaw_rate(turn, unused_columns(tables, columns))
     inputs = {"command.v", "command.omega"} <= roles or pair or wheels
     measured = outside or speeds or place
     for holds, said in (
@@ -149,6 +147,8 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
              "there is neither odometry (v, omega or x, y, yaw) nor an outside pose.")):
         if holds:
             return said
+    if rivals := _rivals(tables, columns):
+        return rivals
     if unsure := [one for one in columns if not one.sure]:
         ticks = next((f" If it counts ticks, say how many make a turn: {one.role}={one.file}/{one.name}:N/rev."
                       for one in unsure if TICKS.search(one.name)), "")
@@ -157,9 +157,42 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
     return ""
 
 
+def _rivals(tables: Sequence[Table], columns: Sequence[Column]) -> str:
+    """A sentence on two columns that may equally be one quantity and differ; empty where there are none."""
+    arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
+    taken = {(one.file, one.name) for one in columns}
+    chosen = {one.role: one for one in columns if one.guessed and one.sure and one.role != "time"
+              and not one.role.startswith("wheels.")}
+    for table in tables:
+        for name in table.columns:
+            other = None if (table.stem, name) in taken else by_name(table, name)
+            mine = chosen.get(other.role) if other is not None and other.sure else None
+            if other is None or mine is None or says_any_stream(mine.name) and not says_any_stream(name):
+                continue
+            if _differ(arrays[mine.file, mine.name], mine, arrays[table.stem, name], other):
+                return (f"{mine.file}/{mine.name} and {table.stem}/{name} may both be {mine.role}, and they differ. "
+                        f"Say which is: {mine.role}=COLUMN.")
+    return ""
+
+
+def _differ(values: np.ndarray, one: Column, others: np.ndarray, other: Column) -> bool:
+    """Whether two columns (T,) hold other numbers; one that states no unit has the other's."""
+    if not (np.isfinite(values).any() and np.isfinite(others).any()) or np.nanmin(others) == np.nanmax(others):
+        return False  # nothing is lost with a column that never changes
+    if len(values) != len(others):
+        return True
+    sizes = [size_of(each.role, each.unit) if is_unit_of(each.role, each.unit) else 1.0
+             for each in (one, other if other.unit else one)]
+    rows = np.arange(len(values))
+    a, b = (np.interp(rows, rows[np.isfinite(numbers)], size * numbers[np.isfinite(numbers)])
+            for numbers, size in zip((values, others), sizes, strict=True))
+    apart = np.angle(np.exp(1j * (a - b))) if kind_of(one.role) == "angle" else a - b  # a heading may be wrapped
+    return bool(np.percentile(np.abs(apart), 90) > SAME * np.ptp(a))
+
+
 def _of_a_camera(tables: Sequence[Table], columns: Sequence[Column]) -> str:
     """A sentence on a trajectory in TUM's form, guessed to be of the floor, whose z moves as none does on a floor."""
-    guessed = {(one.file, one.name): one.role.partition(".")[0] for one in columns if one.why not in ("", SAID)}
+    guessed = {(one.file, one.name): one.role.partition(".")[0] for one in columns if one.guessed}
     for table in tables:
         stream = guessed.get((table.stem, "tx"))
         if stream is None or guessed.get((table.stem, "ty")) != stream or "tz" not in table.columns:
@@ -186,6 +219,13 @@ def _turned(columns: Sequence[Column], arrays: Mapping[tuple[str, str], np.ndarr
             known = one.in_si(values[np.isfinite(values)])
             spans.append(float(np.ptp(np.unwrap(known))) if len(known) else 0.0)
     return min(spans, default=0.0)
+
+
+def without_yaw_rate(turn: float, unused: Sequence[str]) -> str:
+    """What is said of commands without a yaw rate to a vehicle that turns [rad]."""
+    return (f"no column is the commanded yaw rate, though the vehicle turns by {turn:.2g} rad: "
+            f"{f'not used: {first_of(unused)}' if unused else 'all columns are used'}. If none was commanded, add a "
+            "column of zeros for it.")
 
 
 def unused_columns(tables: Sequence[Table], columns: Sequence[Column]) -> list[str]:

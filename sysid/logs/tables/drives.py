@@ -10,8 +10,9 @@ import numpy as np
 
 from sysid.logs.records import name_of
 from sysid.logs.tables.columns import QUANTITIES, Column, Table
-from sysid.logs.tables.decisions import decide, decisions_of, first_of, unused_columns
+from sysid.logs.tables.decisions import decide, decisions_of, first_of, unused_columns, without_yaw_rate
 from sysid.logs.tables.guess import guess, shown_units
+from sysid.logs.tables.sizes import TURNED
 from sysid.logs.tables.streams import as_odometry, as_twist, backward_wheel, dead_reckoned, stream_rows, with_rates
 from sysid.logs.tables.text_table import read_table, text_files
 
@@ -150,9 +151,17 @@ def _join(name: str, source: Path, tables: Sequence[Table], columns: Sequence[Co
     if begin >= end:
         spans = "; ".join(f"{key} {one[0, 0]:.3f} to {one[-1, 0]:.3f} s" for key, one in made.items())
         raise ValueError(f"{source}: the streams of {name} share no time ({spans}). Put them on one clock first.")
-    changing = [replace(table, columns={name: values for name, values in table.columns.items()
-                                        if np.nanmin(values) < np.nanmax(values)}) for table in tables]
-    if unused := unused_columns(changing, columns):
+    turns = [float(np.ptp(made[one][:, 3])) for one in ("odometry", "ground_truth") if one in made]
+    if not {"omega", "left"} & set(streams.get("command", {"omega"})) and min(turns) > TURNED:
+        raise ValueError(f"{source}: {name}: {without_yaw_rate(min(turns), _left_over(tables, columns))}")
+    if unused := _left_over(tables, columns):
         notes.append(f"not used: {first_of(unused)}")
     notes = list(dict.fromkeys(note.removeprefix(f"{name}: ") for note in notes))
     return TextDrive(name, made, tuple(columns), tuple(notes), measured_input)
+
+
+def _left_over(tables: Sequence[Table], columns: Sequence[Column]) -> list[str]:
+    """The columns that change and have no role, each as FILE/COLUMN."""
+    changing = [replace(table, columns={name: values for name, values in table.columns.items()
+                                        if np.nanmin(values) < np.nanmax(values)}) for table in tables]
+    return unused_columns(changing, columns)

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.logs.tables.columns import SAID, STREAMS, Column, Table
-from sysid.logs.tables.names import STREAM_WORDS, by_name, may_be_heading, says_stream, words_of
+from sysid.logs.tables.columns import STREAMS, Column, Table
+from sysid.logs.tables.names import STREAM_WORDS, by_name, may_be_heading, says_any_stream, says_stream, words_of
 from sysid.logs.tables.sizes import with_time_unit, with_units
 
 NEAR = 0.02  # of any unit from 0, at which an odometry begins
@@ -37,7 +37,9 @@ def guess(
                       and (column := by_name(table, name)) is not None and column.role not in settled]
         candidates = _with_headings(candidates, roles)
         long_unit = {"min", "h", "d"}  # a column of hours may stand beside the time itself
-        for column in sorted(candidates, key=lambda one: (not one.sure, one.role == "time" and one.unit in long_unit)):
+        for column in sorted(candidates, key=lambda one: (
+                not one.sure, one.role == "time" and one.unit in long_unit,
+                one.role != "time" and not says_any_stream(one.name))):
             rival = column.role == "time" and any(one.role == "time" and one.file == table.stem for one in found)
             if not rival and column.role not in roles:
                 found.append(column)
@@ -78,8 +80,7 @@ def _origin_counts(found: list[Column], arrays: Mapping[tuple[str, str], np.ndar
     roles = {one.role for one in found}
     words = set(STREAM_WORDS["odometry"])
     nameless = [one for one in found if one.role in ("odometry.x", "odometry.y", "odometry.yaw")
-                and one.why not in ("", SAID)
-                and not says_stream(one.name, "odometry") and not set(words_of(one.file)) & words]
+                and one.guessed and not says_stream(one.name, "odometry") and not set(words_of(one.file)) & words]
     if not nameless or {"odometry.v", "odometry.omega"} & roles:
         return found
     starts = [arrays[one.file, one.name] for one in nameless]

@@ -157,6 +157,12 @@ def says_stream(name: str, stream: str) -> bool:
     return bool(set(words_of(split_unit(name)[0])) & set(STREAM_WORDS[stream]))
 
 
+def says_any_stream(name: str) -> bool:
+    """Whether a name by itself says of which stream it is."""
+    text = " ".join(words_of(split_unit(name)[0]))
+    return bool(set(text.split()) & STREAM_LAST) or "twist twist" in text or "pose pose" in text or "cmd" in text
+
+
 def words_of(name: str) -> list[str]:
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name)
     return [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word and word not in ("field", "data", "msg")]

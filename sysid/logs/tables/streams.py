@@ -81,6 +81,9 @@ def _rows_of_file(
     clock = next(one for one in columns if one.role == "time" and one.file == file)
     found = {"t": clock.in_si(table.columns[clock.name]),
              **{one.role.partition(".")[2]: one.in_si(table.columns[one.name]) for one in mine}}
+    if stream == "command":  # a logger that writes what changed leaves the cell of the other part empty
+        sent = np.isfinite([found[key] for key in found if key != "t"]).any(axis=0)
+        found = {key: values[sent] if key == "t" else _held(values[sent]) for key, values in found.items()}
     whole = np.isfinite(list(found.values())).all(axis=0)
     found = {key: values[whole] for key, values in found.items()}
     notes = _check_clock(file, found["t"])
@@ -108,6 +111,12 @@ def _rows_of_file(
     if "yaw" in found:
         found["yaw"] = np.unwrap(found["yaw"])
     return found, notes
+
+
+def _held(values: np.ndarray) -> np.ndarray:
+    """Values (T,) each of which holds until the next one, in place of nan."""
+    latest = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+    return np.asarray(values[latest])
 
 
 def _spread(t: np.ndarray) -> np.ndarray | None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 
 import numpy as np
 
 from whill_mjx.world.maps.coordinates import read_numbers, unreadable
+from whill_mjx.world.maps.surfaces import HEADROOM
 
 OUTER, INNER = ("outer", "outline", ""), "inner"
 """Roles of the ways around a building, and around its courtyards; others, such as `part`, are no border of it."""
+FEET, STOREY = 0.3048, 3.0  # m
 Place = tuple[float, float]
 
 
@@ -47,11 +50,11 @@ def _read_ways(root: ET.Element) -> tuple[dict[str | None, list[Place]], set[str
     places = {
         node.get("id"): _place(node)
         for node in root.iter("node")
-        if node.get("visible") != "false" and node.get("lat")
+        if _is_there(node) and node.get("lat")
     }
     ways, short = {}, set()
     for way in root.iter("way"):
-        if way.get("visible") != "false":
+        if _is_there(way):
             corners = [places.get(one.get("ref")) for one in way.iter("nd")]
             ways[way.get("id")] = [place for place in corners if place]
             if None in corners:
@@ -74,10 +77,23 @@ def _place(node: ET.Element) -> Place:
     return numbers[0], numbers[1]
 
 
+def _is_there(element: ET.Element) -> bool:
+    """Whether nobody has deleted it, on the server or in the editor that wrote the file."""
+    return element.get("visible") != "false" and element.get("action") != "delete"
+
+
 def _is_building(element: ET.Element) -> bool:
     tags = {tag.get("k"): tag.get("v") for tag in element.iter("tag")}
     below = tags.get("location") == "underground" or (tags.get("layer") or "0").startswith("-")
-    return tags.get("building", "no") not in ("no", "roof") and not below
+    above = _begins_at(tags.get("min_height"), tags.get("building:min_level")) > HEADROOM  # a vehicle passes under it
+    return tags.get("building", "no") not in ("no", "roof") and not below and not above and _is_there(element)
+
+
+def _begins_at(height: str | None, level: str | None) -> float:
+    """Height above the ground [m] at which a building begins, by its tags; 0 where they do not say so."""
+    if found := re.match(r"(\d+(?:\.\d+)?) *(m|'|ft|$)", height or ""):
+        return float(found[1]) * (FEET if found[2] in ("'", "ft") else 1.0)
+    return STOREY * float(level) if level and level.isdecimal() else 0.0
 
 
 def _is_closed(ring: list[Place]) -> bool:
