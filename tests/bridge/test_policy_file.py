@@ -44,6 +44,19 @@ def test_state_advances_with_each_step_and_reset_forgets_it(folder):
 
 
 @pytest.mark.quick
+def test_step_that_was_begun_before_its_image_gives_the_same_and_reset_forgets_what_was_begun(folder):
+    policy, other = Policy.load(folder), Policy.load(folder)
+    assert policy._network.in_halves  # its count needs no image
+    for _ in range(3):
+        np.testing.assert_array_equal(policy.step(colour(9, 8, 7)), other.step(colour(9, 8, 7)))
+        policy.prepare()
+    assert policy._carry[0] == other._carry[0] == 3
+    policy.reset()
+    policy.step(colour(9, 8, 7))
+    assert policy._carry[0] == 1
+
+
+@pytest.mark.quick
 def test_spoilt_state_makes_the_command_not_finite(tmp_path):
     with pytest.raises(PolicyFileError, match="must be finite"):
         Policy.load(tiny_policy.write(tmp_path / "bad", size=8, poison=True))
