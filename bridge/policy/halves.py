@@ -67,20 +67,15 @@ class Cut:
         self._nodes = [_Node(one) for one in self._all(NODE)]
         early = set(self._inputs) - observations - set(self._weights)
         late = set(observations)
-        self._early: list[_Node] = []
-        self._late: list[_Node] = []
-        self._fixed: list[_Node] = []  # what depends on no input: both halves have it, so that it is computed at once
-        for node in self._nodes:
+        for node in self._nodes:  # what depends on no input is in both halves, so that it is computed at once
             if late.intersection(node.takes):
                 late.update(node.gives)
-                self._late.append(node)
+                node.is_early = False
             elif early.intersection(node.takes):
                 early.update(node.gives)
-                self._early.append(node)
-            else:
-                self._fixed.append(node)
-        given = {name for node in self._early for name in node.gives}
-        wanted = {name for node in self._late for name in node.takes}
+                node.is_late = False
+        given = {name for node in self._nodes if not node.is_late for name in node.gives}
+        wanted = {name for node in self._nodes if not node.is_early for name in node.takes}
         self.between = sorted(given & wanted)
         """Names of the values that the first half gives the second."""
         self._first = [name for name in self._outputs if name in given and name not in wanted]
@@ -92,18 +87,19 @@ class Cut:
         """Return the ONNX model of what no observation enters; its outputs are `between` and outputs of the whole."""
         names = [*self.between, *self._first]
         outputs = [self._outputs.get(name) or _field(VALUE_NAME, name.encode()) for name in names]
-        return self._half(self._early, [], names, outputs)
+        return self._half([node for node in self._nodes if node.is_early], [], names, outputs)
 
     def second(self, between: list[Between]) -> bytes:
         """Return the ONNX model of the rest; its inputs are observations, the state and what lies between."""
         inputs = [_declared(one) for one in between]
         names = [name for name in self._outputs if name not in (*self._first, *self._both)]
-        return self._half(self._late, inputs, names, [self._outputs[name] for name in names])
+        late = [node for node in self._nodes if node.is_late]
+        return self._half(late, inputs, names, [self._outputs[name] for name in names])
 
     def _half(self, nodes: "list[_Node]", inputs: list[bytes], names: list[str],
               outputs: Sequence[bytes | memoryview]) -> bytes:
         needed, kept = set(names), []
-        for node in reversed([one for one in self._nodes if one in self._fixed or one in nodes]):
+        for node in reversed(nodes):
             if needed.intersection(node.gives):
                 needed.update(node.takes)
                 kept.append(node)
@@ -121,10 +117,11 @@ class Cut:
 
 
 class _Node:
-    """One operation: what it takes and gives."""
+    """One operation: what it takes and gives, and in which halves it is."""
 
     def __init__(self, content: memoryview) -> None:
         self.content = content
+        self.is_early = self.is_late = True
         parts = list(fields(content))
         self.takes, self.gives = ([bytes(one.value).decode() for one in parts if one.number == wanted and one.value]
                                   for wanted in (TAKES, GIVES))
