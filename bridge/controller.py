@@ -5,6 +5,7 @@ time by chance, a frame trigger adds none. The tick is the backstop that keeps c
 when frames do not.
 """
 
+import contextlib
 import time
 import zlib
 from collections.abc import Callable
@@ -81,6 +82,7 @@ class Controller:
         self._last = Command(0.0, 0.0, "no frame yet")
         self._ticks = 0
         self._uniform: dict[str, int] = {}  # uniform images in a row of each camera
+        self._prepared = 0.0  # time that the next step took before its frame came [s]
 
     def on_image(self, now: float, stamp: float, stamp_age: float, image: RawImage) -> Command | None:
         """Take one camera message; return the command to publish, None where there is none to send now.
@@ -151,7 +153,7 @@ class Controller:
         if supervisor.take_reset():
             self.policy.reset()
             self.senses.begin()
-            self._ticks = 0
+            self._ticks, self._prepared = 0, 0.0
         self._ticks += 1
         if not supervisor.may_drive or (self._ticks - 1) % self.policy.commands.action_repeat:
             return self._send(now, supervisor.tick(now))
@@ -163,9 +165,17 @@ class Controller:
             self.unusable = f"the policy failed: {error}"
             action = np.full(2, np.nan)
         self._watch_novelty()
-        command = supervisor.action(now, action, self._clock() - start)
+        elapsed, prepared, self._prepared = self._clock() - start, self._prepared, 0.0
+        command = supervisor.action(now, action, elapsed, prepared)
         self.senses.sent(command)
         return self._send(now, command)
+
+    def prepare(self) -> None:
+        """Compute what of the next step no observation changes; to be called after each command that was sent."""
+        start = self._clock()
+        with contextlib.suppress(Exception):  # the step then fails the same way, and stops the vehicle
+            self.policy.prepare()
+        self._prepared = max(self._prepared, self._clock() - start)
 
     def on_tick(self, now: float) -> Command | None:
         """Return a command where one is due although no frame came: a stop at once, else the last one again."""

@@ -197,6 +197,11 @@ class DriveNode(VehicleNode):
 
         return heard
 
+    def _publish(self, command: Command | None) -> None:
+        """Send a command, and then begin the next step: its frame is still far."""
+        super()._publish(command)
+        self.controller.prepare()
+
     def _stamp_of(self, message: Any) -> tuple[float, float]:
         """Return the stamp of a message and its age [s], on the node's clock."""
         stamp = ros.stamp_seconds(message.header.stamp)

@@ -187,7 +187,7 @@ def read_beat(text: str, **fields: type) -> dict[str, Any]:
 class GuardLink:
     """The policy node's side: starts a guard, sends heartbeats and judges those that come back; pure but for `start`.
 
-    All times are of a steady clock.
+    Times are those in which the node's limits count: of the steady clock, or a `VehicleTime`.
     """
 
     STALE = 0.5
@@ -207,13 +207,18 @@ class GuardLink:
         self._started = -self.RESTART
         self._beats: dict[str, tuple[float, dict[str, Any]]] = {}  # time and content of each guard's last heartbeat
 
-    def keep(self, now: float) -> None:
-        """Start the guard, or start it again where it has ended; end one that has chosen another type of commands."""
+    def keep(self, now: float, steady: float) -> None:
+        """Start the guard, or start it again where it has ended; end one that has chosen another type of commands.
+
+        Args:
+            now: as of `heard` [s].
+            steady: of the steady clock [s]: a process does not wait for a simulation.
+        """
         if self._process is not None and self.problem(now) == self._wrong_type:
             self._process.terminate()
         ended = self._process is None or self._process.poll() is not None
-        if self._start is not None and ended and now - self._started >= self.RESTART:
-            self._process, self._started = self._start(), now
+        if self._start is not None and ended and steady - self._started >= self.RESTART:
+            self._process, self._started = self._start(), steady
             self._beats.clear()  # what the one before said counts no more
 
     def heard(self, now: float, text: str) -> bool:

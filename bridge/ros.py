@@ -160,9 +160,13 @@ def is_reliable(policy: Any) -> bool:
 def hears_commands(requested: Any) -> bool:
     """Return whether a subscriber's quality of service, as the graph gives it, lets it hear `reliable` commands.
 
-    They are not kept for late joiners, and promise neither a deadline nor signs of life. `qos_check_compatible` of
-    rclpy takes the endless deadline of the graph for one.
+    They are not kept for late joiners, and promise neither a deadline nor signs of life, nor who gives these.
+    `qos_check_compatible` of rclpy takes the endless deadline of the graph for one.
     """
+    from rclpy.qos import LivelinessPolicy
+
+    if requested.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:  # refused although it may wait for them without end
+        return False
     times = requested.deadline.nanoseconds, requested.liveliness_lease_duration.nanoseconds
     return not is_latched(requested.durability) and not any(0 < one < ENDLESS for one in times)
 

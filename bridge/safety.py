@@ -220,15 +220,16 @@ class Supervisor:
             self._cause, self._reset, self._commanded = "", True, now
         return verdict
 
-    def action(self, now: float, action: np.ndarray, elapsed: float = 0.0) -> Command:
+    def action(self, now: float, action: np.ndarray, elapsed: float = 0.0, before: float = 0.0) -> Command:
         """Return the command for a policy output.
 
         Args:
             now: steady time [s].
             action: (2,) v [m/s], omega [rad/s] as the policy wants them.
             elapsed: how long the policy step took [s].
+            before: how long it took before its frame came [s].
         """
-        self._overruns = self._overruns + 1 if elapsed > self.config.overrun else 0
+        self._overruns = self._overruns + 1 if before + elapsed > self.config.overrun else 0
         if self._overruns:
             self.counts["overrun"] += 1
         if not np.isfinite(action).all():

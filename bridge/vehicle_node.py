@@ -246,7 +246,7 @@ class VehicleNode:
         for topic in (self.commands, *self._drivers):
             topic.look()
         self.guard.kind = self.commands.kind  # a tool that listens in another type must not mislead the guard
-        self.guard.keep(now)
+        self.guard.keep(self.now(), now)
         self._listeners = self.commands.listeners()
         self.supervisor.block(NO_BASE, not any(map(self.commands.hears_us, self._listeners)))
         self._mixed = [mixed(topic, found, "values") for topic, found in self._signals() if len(found) > 1]

@@ -91,7 +91,7 @@ class Choice(NamedTuple):
 
 
 def act(
-    config: DreamerConfig, params: Params, carry: Carry, obs: Any, is_first: jax.Array, choice: Choice
+    config: DreamerConfig, params: Params, carry: Carry, obs: Any, is_first: jax.Array | None, choice: Choice
 ) -> tuple[Carry, jax.Array]:
     """Infer the state of N instances from their frames and choose actions.
 
@@ -100,13 +100,15 @@ def act(
         params: of the agent.
         carry: from `init_carry` or the previous call.
         obs: (N, ...) as the environment shows it.
-        is_first: (N,) bool, resets the carry.
+        is_first: (N,) bool, resets the carry; None: none of them.
         choice: how actions are chosen.
 
     Returns:
         The carry, whose latent is the state after this frame, and actions (N, A), not clipped; one-hot classes.
     """
-    keep = {name: jnp.where(is_first[:, None], jnp.zeros_like(value), value) for name, value in carry.items()}
+    keep = carry if is_first is None else {
+        name: jnp.where(is_first[:, None], jnp.zeros_like(value), value) for name, value in carry.items()
+    }
     tokens = sensors.encode(config, params["enc"], obs)
     uniform = None
     if choice.key is not None:
@@ -141,7 +143,7 @@ def policy_step(config: DreamerConfig, params: Params, carry: Carry, obs: Any) -
     config = dataclasses.replace(config, compute_dtype="float32")
     batched = {name: value[None].astype(jnp.float32) for name, value in carry.items()}
     obs = jax.tree.map(lambda x: x[None], obs)
-    new_carry, action = act(config, params, batched, obs, jnp.zeros((1,), bool), Choice())
+    new_carry, action = act(config, params, batched, obs, None, Choice())
     return {name: value[0] for name, value in new_carry.items()}, action[0]
 
 
@@ -154,8 +156,9 @@ def believed(params: Params, carry: Carry, obs_shape: Mapping[str, spaces.Shape]
         obs_shape: shapes of all that is observed in training, targets of the decoder among them.
         name: of the vector.
     """
-    features = jnp.concatenate([carry["deter"], carry["stoch"]], -1)
-    return dist.symexp(sensors.decode_vector(params["dec"], features)[..., spaces.place_of(obs_shape, name)])
+    parts = [jnp.atleast_2d(carry[part]) for part in ("deter", "stoch")]  # of rows: a runtime's fastest product
+    found = sensors.decode_vector(params["dec"], jnp.concatenate(parts, -1))[..., spaces.place_of(obs_shape, name)]
+    return dist.symexp(found).reshape(*carry["deter"].shape[:-1], -1)
 
 
 def policy_carry(config: DreamerConfig, action_dim: ActionSpec) -> Carry:

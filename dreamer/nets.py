@@ -156,6 +156,14 @@ def conv_pool(params: Params, blocks: jax.Array) -> jax.Array:
     return norm_act(x + params["b"].astype(x.dtype), params["scale"])
 
 
+def conv_pool_pixels(params: Params, x: jax.Array) -> jax.Array:
+    """`conv_pool` of an image in pixels: (M, H, W, I) -> (M, H / 2, W / 2, O)."""
+    y = jax.lax.conv_general_dilated(x, params["w"].astype(x.dtype), (1, 1), "SAME",
+                                     dimension_numbers=("NHWC", "HWIO", "NHWC"))
+    y = jax.lax.reduce_window(y, -jnp.inf, jax.lax.max, (1, 2, 2, 1), (1, 2, 2, 1), "VALID")
+    return norm_act(y + params["b"].astype(y.dtype), params["scale"])
+
+
 def upsample_conv(params: Params, x: jax.Array) -> jax.Array:
     """Nearest-neighbour doubling and 5x5 convolution: (M, H, W, I) -> (M, H, W, 4, O), the result in block form."""
     outputs = params["w"].shape[-1]

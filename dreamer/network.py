@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from dreamer import onnx_graph
+
 OPSET = 18
 """ONNX operator set of the file. 18 is readable by onnxruntime 1.14 and newer, so also by a vehicle's older system."""
 IR_VERSION = 8
@@ -83,6 +85,8 @@ def to_onnx(network: Network) -> bytes:
     finally:
         quiet.setLevel(level)
     model = onnx.inliner.inline_local_functions(model)
+    onnx_graph.repair_pools(model.graph)
+    onnx_graph.split_products(model.graph)
     _name_outputs(model, outputs)
     model.ir_version = IR_VERSION
     nodes = model.graph.node

@@ -1,5 +1,7 @@
 """Reads a checked policy file and runs it on a vehicle, one image after the other."""
 
+import ctypes
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,7 @@ from bridge.policy.contract import (
     parse_contract,
     parse_hashes,
 )
+from bridge.policy.network import Arrays, Network, build
 from bridge.policy.parts import COPY_AGAIN, EXPORT_AGAIN, TABLE, Parts, PolicyFileError
 from bridge.policy.sensors import SHAPES, SensorInput, pacer_of
 from bridge.policy.trial import Trial
@@ -66,38 +69,27 @@ def read_policy(path: str | Path, kinds: tuple[str, ...] = (KIND,)) -> CheckedPo
                 for part, want in hashes.items() if part not in OPTIONAL}
         with Trial() as trial:  # its process starts while the large archive is read
             _check_archive(parts, hashes)
-            import onnxruntime  # noqa: F401  (meanwhile: `make_session` needs it)
+            import onnxruntime  # noqa: F401  (meanwhile: `build` needs it)
 
             trial.run(parts.name("policy.onnx"), kept["policy.onnx"], *contract.tensors())
     return CheckedPolicy(str(path), contract, hashes, kept["policy.onnx"], kept.get("vehicle.toml"))
 
 
 def make_session(policy: CheckedPolicy) -> Any:
-    """Build the onnxruntime session of a checked policy; the trial has already built it once."""
-    import onnxruntime
-
-    onnxruntime.set_default_logger_severity(3)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1  # one thread has the lower tail latency on a vehicle's shared cores
-    options.inter_op_num_threads = 1
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    session = onnxruntime.InferenceSession(policy.network, options, providers=["CPUExecutionProvider"])
-    session.disable_fallback()
-    vars(session).pop("_model_bytes", None)  # it keeps the whole file to build itself again for a fallback
-    return session
+    """Build the onnxruntime session of a checked policy, whole; the trial has already built it once."""
+    return build(policy.network)
 
 
 class Policy:
     """A recurrent policy of a vehicle. `step` maps what its sensors show to one command and advances the state."""
 
-    def __init__(self, contract: Contract | AgentContract, session: Any, name: str = "policy") -> None:
-        """Prepare a policy whose contract says what its actions and observations are."""
+    def __init__(self, contract: Contract | AgentContract, network: bytes, name: str = "policy") -> None:
+        """Build a policy from its ONNX model; its contract says what its actions and observations are."""
         commands, pacer = contract.commands, pacer_of(contract.sensors)
         assert commands is not None and pacer is not None
         self.contract, self.commands, self.sensors, self.name = contract, commands, contract.sensors, name
         self.pacer: SensorInput = pacer
         """The sensor whose messages make a step."""
-        self._session = session
         self._low = np.array(commands.low)
         self._span = np.array(commands.high) - self._low
         inputs, _ = contract.tensors()
@@ -105,7 +97,11 @@ class Policy:
         self._state_names = [f"carry_{one.name}" for one in contract.carry] if agent else list(contract.inputs[1:])
         self._inputs = {one.name: one for one in inputs if one.name not in self._state_names}
         self._alone = next(iter(self._inputs)) if len(self._inputs) == 1 else ""
+        self._network = Network(network, self._inputs)
+        self._begin: Arrays | None = None  # of the zero state
         self.reset()
+        self.prepare()
+        self._begin = self._early
 
     @classmethod
     def load(cls, path: str | Path) -> "Policy":
@@ -117,7 +113,9 @@ class Policy:
         checked = read_policy(path, (KIND, AGENT_KIND))
         contract = checked.contract
         _check_drives(f"{path}/{TABLE}", contract)
-        policy = cls(contract, make_session(checked), str(path))
+        policy = cls(contract, checked.network, str(path))
+        del checked
+        _give_back_memory()
         policy.step(policy.zeros())  # the first step takes longest
         policy.reset()
         return policy
@@ -125,6 +123,15 @@ class Policy:
     def reset(self) -> None:
         """Forget everything seen: the zero state is the start of an episode."""
         self._carry = [np.zeros(spec.shape, spec.dtype) for spec in self.contract.carry]
+        self._early = self._begin
+
+    def prepare(self) -> None:
+        """Compute what of the next step no observation changes; to be called when there is time, after a step."""
+        if self._early is None:
+            self._early = self._network.early(self._state())
+
+    def _state(self) -> dict[str, np.ndarray]:
+        return dict(zip(self._state_names, self._carry, strict=True))
 
     def zeros(self) -> dict[str, np.ndarray]:
         """Return zeros [-] of the shape (...) of each observation, by the names of the network's inputs."""
@@ -146,8 +153,11 @@ class Policy:
                 found = "none" if value is None else f"{value.shape} {value.dtype}"
                 raise ValueError(f"{self.name}: {name} is {found}; the policy needs {want.shape} {want.dtype}. Convert "
                                  "it (an image: bridge.image.to_rgb8).")
-        feed = {name: given[name] for name in self._inputs} | dict(zip(self._state_names, self._carry, strict=True))
-        action, *self._carry = self._session.run(list(self.contract.outputs), feed)
+        self.prepare()
+        assert self._early is not None
+        results = self._network.late({name: given[name] for name in self._inputs}, self._state(), self._early)
+        action, *self._carry = (results[name] for name in self.contract.outputs)
+        self._early = None
         if not all(np.isfinite(value).all() for value in self._carry if value.dtype.kind == "f"):
             return np.full(2, np.nan)
         return self._low + self._span * (np.asarray(action, np.float64) + 1) / 2
@@ -163,6 +173,14 @@ class Policy:
             if spec.name == SURPRISE:
                 return float(np.mean(value))
         return float("nan")
+
+
+def _give_back_memory() -> None:
+    """Return to the system what reading the files took: glibc keeps freed memory, more than the policy needs."""
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)
 
 
 def _check_drives(name: str, contract: Contract | AgentContract) -> None:

@@ -95,11 +95,13 @@ class QoSProfile:
     reliability: str = "RELIABLE"
     durability: str = "VOLATILE"
     deadline: Duration = Duration()
+    liveliness: str = "AUTOMATIC"
     liveliness_lease_duration: Duration = Duration()
 
 
 class Policy:
     KEEP_LAST, BEST_EFFORT, RELIABLE, TRANSIENT_LOCAL = "KEEP_LAST", "BEST_EFFORT", "RELIABLE", "TRANSIENT_LOCAL"
+    MANUAL_BY_TOPIC = "MANUAL_BY_TOPIC"
 
 
 @dataclass
@@ -217,7 +219,7 @@ def install():
         "rclpy.executors": {"SingleThreadedExecutor": SingleThreadedExecutor},
         "rclpy.duration": {"Duration": Duration},
         "rclpy.qos": {"QoSProfile": QoSProfile, "HistoryPolicy": Policy, "ReliabilityPolicy": Policy,
-                      "DurabilityPolicy": Policy},
+                      "DurabilityPolicy": Policy, "LivelinessPolicy": Policy},
         "rclpy.qos_event": {"SubscriptionEventCallbacks": SubscriptionEventCallbacks,
                             "UnsupportedEventTypeError": UnsupportedEventTypeError},
         "rclpy.signals": {"SignalHandlerOptions": types.SimpleNamespace(NO=0)},

@@ -48,6 +48,9 @@ class ScriptedPolicy:
         self.steps = 0
         self.resets += 1
 
+    def prepare(self):
+        pass
+
     def step(self, image):
         self.steps += 1
         return np.array(self.action)
@@ -262,3 +265,30 @@ def test_surroundings_unlike_the_training_slow_down_and_then_stop_until_an_opera
     if action == "stop":
         assert world.controller.supervisor.arm()
         assert [world.image().v for _ in range(5)][-1] == 0.4
+
+
+@pytest.mark.quick
+def test_step_whose_beginning_takes_too_long_counts_as_too_slow():
+    world = World()
+    world.drive()
+    times = iter(np.cumsum([0.0, 0.07, 0.0, 0.02] * 3))  # beginning and end of both parts: 90 ms of 80 allowed
+    world.controller._clock = lambda: next(times)
+    commands = []
+    for _ in range(3):
+        world.controller.prepare()
+        commands.append(world.image())
+    assert [command.reason for command in commands] == ["", "", "policy too slow"]
+
+
+@pytest.mark.quick
+def test_step_that_cannot_be_begun_fails_when_its_frame_comes(monkeypatch):
+    world = World()
+    world.drive()
+
+    def fail(*_):
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(world.policy, "prepare", fail)
+    world.controller.prepare()
+    monkeypatch.setattr(world.policy, "step", fail)
+    assert world.image().reason == "non-finite action" and world.controller.supervisor.counts["policy error"] == 1

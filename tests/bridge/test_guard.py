@@ -124,16 +124,28 @@ def test_guard_that_sends_another_type_than_the_base_hears_is_none_and_is_starte
 
     link = GuardLink("me", "/cmd_vel", start)
     link.kind = "TwistStamped"
-    link.keep(0.0)
+    link.keep(0.0, 0.0)
     link.heard(1.0, json.dumps({**GOOD, "type": ""}))
     assert link.problem(1.0) == ""
     link.heard(1.1, json.dumps(GOOD))
     assert "no TwistStamped" in link.problem(1.1)
-    link.keep(1.2)
+    link.keep(1.2, 1.2)
     assert started[0].returncode == 0 and "ended" in link.problem(1.3)
-    link.keep(2.1)
+    link.keep(2.1, 2.1)
     link.heard(2.2, json.dumps({**GOOD, "guard": "second", "type": "TwistStamped"}))
     assert len(started) == 2 and link.problem(2.2) == "" and started[1].returncode is None
+
+
+def test_guard_of_another_type_is_ended_in_simulated_time_too():
+    """Vehicle time stands while the simulation does, so it falls behind the steady clock."""
+    process = Process()
+    process.terminate = lambda: setattr(process, "returncode", 0)
+    link = GuardLink("me", "/cmd_vel", lambda: process, simulated=True)
+    link.kind = "TwistStamped"
+    link.keep(1.0, 1.0)
+    link.heard(2.0, json.dumps(GOOD))
+    link.keep(2.1, 60.0)
+    assert process.returncode == 0
 
 
 def test_guard_of_an_earlier_node_on_the_same_topics_does_not_disturb():
@@ -185,14 +197,14 @@ def test_guard_that_ended_is_started_again_after_a_pause():
         return started[-1]
 
     link = GuardLink("me", "/cmd_vel", start)
-    link.keep(0.0), link.keep(1.0)
+    link.keep(0.0, 0.0), link.keep(1.0, 1.0)
     assert len(started) == 1
     started[0].returncode = 1
     assert link.problem(1.1) == "the guard ended with code 1"
-    link.keep(1.2)
+    link.keep(1.2, 1.2)
     assert len(started) == 1
     link.heard(2.05, json.dumps(GOOD))
-    link.keep(2.1)
+    link.keep(2.1, 2.1)
     assert len(started) == 2 and link.problem(2.11) == "no guard is running"  # whatever the dead one said
 
 
@@ -212,7 +224,7 @@ def test_guard_that_does_not_end_when_it_is_asked_is_killed():
 
     process = Stopped()
     link = GuardLink("me", "/cmd_vel", lambda: process)
-    link.keep(0.0)
+    link.keep(0.0, 0.0)
     link.close()
     assert process.told == ("terminate", "kill") and process.poll() == -9
 

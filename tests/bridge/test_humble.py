@@ -59,7 +59,9 @@ class Policy:
     sensors = {"image": pacer}
     reset = lambda self: None
     step = lambda self, image: np.array([0.2, 0.1])
+    prepare = lambda self: begun.append(len(node.publishers["/whill/controller/cmd_vel"].sent))
 
+begun = []  # commands sent before each beginning of a next step
 vehicle_node.LOOK_PERIOD = commands.SETTLE = 0.0
 options = drive.parse_arguments(["policy", "--guard", "other", *sys.argv[1:]])
 node = humble_stub.Node("bridge_drive")
@@ -80,6 +82,7 @@ for i in range(6):
     image = humble_stub.Image(height=8, width=8, encoding="rgb8", step=24, data=bytes([i]) * 192)
     image.header.stamp = humble_stub.Time(nanosec=(i + 1) * 10**8)
     node.deliver("/" + options.image_topic, image)
+    assert begun[-1] == len(node.publishers["/whill/controller/cmd_vel"].sent)  # the next step begins after the command
     time.sleep(0.012)  # housekeeping waits until the frame is done
     node.fire()
 watch = guard.GuardNode(humble_stub.Node("bridge_guard"), guard.parse_arguments([]))
@@ -110,6 +113,7 @@ for i in range(6):
 print(bridge.supervisor.state.value, bridge.supervisor.holds, node.publishers["/whill/controller/cmd_vel"].sent)
 """
 FAST = START + """
+begun = []  # commands sent before each beginning of a next step
 vehicle_node.LOOK_PERIOD = vehicle_node.STATUS_PERIOD = 0.02
 vehicle_node.OVERDUE = 0.05
 statuses, end = node.publishers["/bridge/status"].sent, time.monotonic() + 30

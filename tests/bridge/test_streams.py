@@ -95,10 +95,11 @@ def test_commands_that_the_middleware_lost_are_reported():
     ({}, True), ({"depth": 10}, True), ({"deadline": 2**63 - 1}, True), ({"deadline": 10**8}, False),
     ({"durability": "TRANSIENT_LOCAL"}, False), ({"reliability": "BEST_EFFORT"}, True),
     ({"liveliness_lease_duration": 2**63 - 1}, True), ({"liveliness_lease_duration": 10**8}, False),
+    ({"liveliness": "AUTOMATIC"}, True), ({"liveliness": "MANUAL_BY_TOPIC"}, False),
 ])
 def test_base_hears_commands_unless_it_asks_for_kept_ones_a_deadline_or_signs_of_life(profile, hears):
     from rclpy.duration import Duration
-    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+    from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
     from bridge import ros
 
@@ -106,6 +107,6 @@ def test_base_hears_commands_unless_it_asks_for_kept_ones_a_deadline_or_signs_of
         return Duration(nanoseconds=value)
 
     make = {"deadline": time, "liveliness_lease_duration": time, "durability": DurabilityPolicy.__getitem__,
-            "reliability": ReliabilityPolicy.__getitem__, "depth": int}
+            "reliability": ReliabilityPolicy.__getitem__, "liveliness": LivelinessPolicy.__getitem__, "depth": int}
     asked = QoSProfile(**{"depth": 1, **{name: make[name](value) for name, value in profile.items()}})
     assert ros.hears_commands(asked) == hears

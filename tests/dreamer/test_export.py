@@ -239,6 +239,33 @@ def test_policy_of_the_learner_runs_on_the_vehicle_as_it_does_in_jax(tmp_path, e
     assert np.ptp(commands, axis=0).min() > 1e-3  # the actions do depend on what is seen
 
 
+def test_windows_over_a_batch_of_images_run_on_the_vehicle(tmp_path):
+    def step(carry, image):
+        x = image[None].astype(jnp.float32) / 255
+        top = lax.reduce_window(x, -jnp.inf, lax.max, (1, 4, 2, 1), (1, 4, 2, 1), "VALID")
+        return {"h": carry["h"] + top.mean()}, jnp.tanh(top[0, 1, 2, :2] - carry["h"])
+
+    path = export_policy(tmp_path / "p", step, {"h": np.zeros(2, np.float32)}, {}, CONTRACT, check_steps=5)
+    assert json.loads((path / "policy.json").read_text())["parity"]["max_abs_action_difference"] < 1e-6
+
+
+def test_frame_reads_no_weight_that_only_the_state_before_it_meets(tmp_path):
+    """A product with (state, image) side by side is two products: the state's is over when the frame comes."""
+    from bridge.policy.halves import Cut
+
+    weights = jax.random.normal(jax.random.key(0), (1024 + 768, 64)) / 50
+
+    def step(carry, image):
+        deter = jnp.tanh(carry["deter"] + 1)
+        both = jnp.concatenate([deter[None], image.reshape(1, -1).astype(jnp.float32) / 255], -1)
+        return {"deter": deter}, jnp.tanh(both @ weights)[0, :2]
+
+    carry = {"deter": np.zeros(1024, np.float32)}
+    path = export_policy(tmp_path / "p", step, carry, {}, CONTRACT, check_steps=20)
+    cut = Cut((path / "policy.onnx").read_bytes(), frozenset(["image"]))
+    assert len(cut.first()) > 4 * 1024 * 64 and len(cut.second([])) < 4 * 1024 * 64
+
+
 def test_exporting_leaves_jax_as_it_was(tmp_path):
     before = dict(vars(jnp))
     step = lambda carry, image: (carry, jnp.tanh(jnp.cumsum(carry["h"])))  # noqa: E731

@@ -63,6 +63,7 @@ def test_block_convolution_equals_convolution_and_pooling():
     pooled = plain_conv(x, params).reshape(2, 4, 2, 4, 2, 4).max((2, 4))
     expected = nets.norm_act(pooled, params["scale"])
     np.testing.assert_allclose(nets.conv_pool(params, nets.space_to_depth(x)), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(nets.conv_pool_pixels(params, x), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_folded_upsampling_equals_doubling_and_convolution():

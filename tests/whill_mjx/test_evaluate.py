@@ -171,6 +171,20 @@ def test_an_operator_of_other_libraries_agrees_with_onnxruntime(kind, attributes
 
 
 @pytest.mark.quick
+def test_largest_values_of_windows_agree_with_onnxruntime():
+    import onnxruntime
+    from onnx import TensorProto, helper
+
+    pool = helper.make_node("MaxPool", ["x"], ["y"], kernel_shape=[2, 3], strides=[2, 1], pads=[0, 1, 1, 1])
+    graph = helper.make_graph([pool], "pool", [helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 2, 5, 4])],
+                              [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)])  # fmt: skip
+    data = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8).SerializeToString()
+    x = np.random.default_rng(0).normal(size=(1, 2, 5, 4)).astype(np.float32)
+    [theirs] = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"]).run(None, {"x": x})
+    np.testing.assert_array_equal(Network(data)(x)[0], theirs)
+
+
+@pytest.mark.quick
 def test_sums_of_large_exponentials_do_not_overflow():
     from onnx import TensorProto, helper
 

@@ -190,6 +190,22 @@ def _conv(xp, attributes, count, values, kernel, bias=None):
     return result if bias is None else result + jnp.reshape(bias, (1, -1, *[1] * rank))
 
 
+def _max_pool(xp, attributes, count, values):
+    rank = values.ndim - 2
+    pads = attributes.get("pads", [0] * 2 * rank)
+    if attributes.get("ceil_mode", 0) or attributes.get("auto_pad", b"NOTSET") != b"NOTSET" or count > 1:
+        raise ValueError("only plain max-pooling is known here. Evaluate with the runtime 'onnxruntime' instead.")
+    return jax.lax.reduce_window(
+        jnp.asarray(values),
+        -jnp.inf,
+        jax.lax.max,
+        window_dimensions=(1, 1, *attributes["kernel_shape"]),
+        window_strides=(1, 1, *attributes.get("strides", [1] * rank)),
+        padding=((0, 0), (0, 0), *zip(pads[:rank], pads[rank:], strict=True)),
+        window_dilation=(1, 1, *attributes.get("dilations", [1] * rank)),
+    )
+
+
 def _softmax(xp, attributes, count, values):
     return jax.nn.softmax(jnp.asarray(values), axis=attributes.get("axis", -1))
 
@@ -282,6 +298,7 @@ OPERATORS: dict[str, Operator] = {
     "LogSoftmax": lambda xp, a, count, values: jax.nn.log_softmax(jnp.asarray(values), axis=a.get("axis", -1)),
     "MatMul": _elementwise("matmul"),
     "Max": _folded("maximum"),
+    "MaxPool": _max_pool,
     "Mean": lambda xp, a, count, *values: _folded("add")(xp, a, count, *values) / len(values),
     "Min": _folded("minimum"),
     "Mod": _mod,
