@@ -63,7 +63,7 @@ def look(
             q = np.where(better[..., None], row, q)
         found = ScanPoint(gain, worth, q)
     kept = _kept(found.q, upper)
-    return ScanPoint(found.gain * kept, found.worth * kept, found.q)
+    return ScanPoint(found.gain * kept, found.worth * kept, _as_simulated(found.q, columns, axes))
 
 
 def _fit(solver: Solver, index: Sequence[int], wander: np.ndarray, moments: np.ndarray | None,
@@ -72,6 +72,15 @@ def _fit(solver: Solver, index: Sequence[int], wander: np.ndarray, moments: np.n
     q = np.linalg.solve(information, solver.score(index, moments)[..., None])[..., 0] + away
     whole = np.linalg.inv(np.linalg.inv(information) + wander)
     return ScanPoint(np.einsum("...i,ij,...j->...", q, information, q), np.einsum("...i,ij,...j->...", q, whole, q), q)
+
+
+def _as_simulated(q: np.ndarray, columns: Columns, axes: Sequence[Axis]) -> np.ndarray:
+    """Coordinates (..., k) found at a level, with the size beside which axes that only act through others were
+    simulated. Where those others do nothing by themselves, as a limit that is not reached, they are found at 0: the
+    whole effect would be gone."""
+    dependent = np.array([axis.dependent for axis in axes])
+    through = (q[..., ~dependent] == 0).all(-1) & (q[..., dependent] != 0).any(-1)
+    return np.where(through[..., None] & ~dependent, columns.level, q)
 
 
 def _kept(q: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -277,5 +286,9 @@ def _looked(
             np.maximum.at(null.T, numbers, worths[:, 1:])
             for m, number in enumerate(numbers):
                 if worths[m, 0] > worth[number]:
-                    gain[number], worth[number], found[number] = gains[m, 0], worths[m, 0], q[m, 0]
+                    gain[number], worth[number] = gains[m, 0], worths[m, 0]
+                    sides = bench.columns[first[m]], bench.columns[second[m]]
+                    parts = np.split(q[m, 0], [len(sides[0].index)])
+                    found[number] = np.concatenate([_as_simulated(part, one, hypotheses[one.hypothesis].axes)
+                                                    for part, one in zip(parts, sides, strict=True)])
     return gain, worth, tuple(found), null

@@ -8,8 +8,9 @@ import pytest
 from linear_drives import EFFECTS, SPREAD, Linear, drives
 
 from sysid.follow_up.power import SEED, Days, false_alarms, power_curve
+from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import no_wander
-from sysid.missing.evidence import column_layout
+from sysid.missing.evidence import Solver, column_layout
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_tables import detectable
 from sysid.verdict import rounds
@@ -17,7 +18,7 @@ from sysid.verdict.found import tail
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import begin
-from sysid.verdict.scan import CHI_SQUARED, null_days, run, scan_again, scan_pairs
+from sysid.verdict.scan import CHI_SQUARED, best, null_days, run, scan_again, scan_pairs
 from sysid.verdict.search import pairs_of as pairs_of_effects
 from sysid.verdict.search import settle
 
@@ -45,6 +46,24 @@ def test_two_effects_that_hide_one_another_are_found_together(wander):
     assert pairs.gain[best] > 2 * alone.gain.max()
     assert pairs.p_family < 0.01 and pairs.p_family < alone.p_family
     assert pairs.q[best] == pytest.approx([1.0, -1.0], abs=0.4)
+
+
+def test_what_acts_only_through_another_axis_is_found_beside_the_size_that_it_was_simulated_at():
+    """A limit of the speed that is not reached, but falls with the load: at 0 of the limit nothing would fall."""
+    limit = Hypothesis("limit", (Axis("limit.speed", 10.0, form="inverse"), Axis("limit.droop", 1.0, dependent=True)))
+    columns, plain = column_layout((limit, EFFECTS[2]), 1), drives(np.zeros(4))
+    design = np.random.default_rng(1).standard_normal((*plain.residual.shape, 12))
+    design[..., [one.index[0] for one in columns[:-1]]] = 0.0
+    [through] = [one.index[1] for one in columns[:-1] if one.level == 2.0]
+    residual = plain.residual + 0.7 * design[..., through] + 0.5 * design[..., -1]
+    evidence = replace(
+        plain, residual=residual, design=design, columns=columns, products=np.einsum("bni,bnj->bij", design, design),
+        moments=np.einsum("bni,bn->bi", design, residual), pool_moments=tuple(np.zeros((2, 12)) for _ in residual))
+    wander = no_wander(columns)
+    assert best(Solver(evidence), (limit, EFFECTS[2]), wander)[2][0] == pytest.approx([2.0, 0.7], abs=0.15)
+    nulls = null_days(evidence, SPREAD, wander, 20, np.random.default_rng(0))
+    [both] = scan_pairs(evidence, (limit, EFFECTS[2]), wander, nulls, np.eye(2), 0.9).q
+    assert both == pytest.approx([2.0, 0.7, 0.5], abs=0.15)
 
 
 def test_other_drives_are_held_against_the_nulls_of_a_scan_made_before(wander):
