@@ -31,6 +31,14 @@ SAME: dict[str, dict[str, str]] = {
                    "noise_factor_coverage": "noise_factor_coverage_noise"},
 }  # fmt: skip
 """Of each file, the fixed names of figures that have another name too."""
+ELSEWHERE: dict[str, dict[str, tuple[str, str]]] = {
+    "speed": {"start_warm_s": ("fit", "cpu_seconds_compiled"), "loop_cpu_s": ("undeclared", "cpu_seconds"),
+              "loop_gpu_s": ("undeclared", "gpu_seconds")},
+}  # fmt: skip
+"""Of each file, the fixed names of figures in other files."""
+ON_ANY_DEVICE = ("first_step_cold_s", "first_step_warm_s", "course_cold_s", "course_warm_s", "ppo_99_cold_s",
+                 "ppo_99_warm_s")
+"""Figures of `speed` that a processor stands in for until an accelerator has measured them."""
 Figures = dict[str, dict[str, Any]]
 
 
@@ -60,6 +68,12 @@ def lowest_srcc(figures: Figures) -> Figures:
     return {"srcc": {**figures[lowest], "of": found}}
 
 
+def standing_in(figures: Figures) -> Figures:
+    """Seconds of a processor, where no accelerator has measured them."""
+    return {name: {**figures[f"cpu_{name}"], "of": [f"cpu_{name}"]} for name in ON_ANY_DEVICE
+            if f"cpu_{name}" in figures and (name not in figures or figures[name]["device"].startswith("cpu"))}
+
+
 def code_lines(tree: ast.AST) -> int:
     """Lines of code below a node, without those of docstrings."""
     lines = {line for node in ast.walk(tree) if isinstance(node, ast.expr | ast.stmt) and hasattr(node, "lineno")
@@ -83,22 +97,31 @@ def counted_in_examples(figures: Figures) -> Figures:
 
 
 DERIVED: dict[str, Callable[[Figures], Figures]] = {
-    "measured": ladder, "sight": lowest_srcc, "environment": counted_in_examples,
+    "measured": ladder, "sight": lowest_srcc, "environment": counted_in_examples, "speed": standing_in,
 }  # fmt: skip
 """Of each file, what follows from its figures or from the sources."""
+
+
+def read_figures(stem: str) -> Figures:
+    """The figures of a result file."""
+    return dict(json.loads((RESULTS / f"{stem}.json").read_text())["figures"])
 
 
 def fixed(stem: str, figures: Figures) -> Figures:
     """The figures of a file under their fixed names."""
     same = {name: {**figures[source], "of": [source]} for name, source in SAME.get(stem, {}).items()
             if source in figures}
+    for name, (other, source) in ELSEWHERE.get(stem, {}).items():
+        there = read_figures(other)
+        if source in there:
+            same[name] = {**there[source], "of": [f"{other}: {source}"]}
     return {**same, **DERIVED.get(stem, lambda _: {})(figures)}
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Write the fixed names into all result files."""
     Parser(prog="python -m benchmarks.fixed_names", description=__doc__).parse_args(arguments)
-    for stem in sorted({*SAME, *DERIVED}):
+    for stem in sorted({*SAME, *ELSEWHERE, *DERIVED}):
         path = RESULTS / f"{stem}.json"
         content = json.loads(path.read_text())
         found = fixed(stem, content["figures"])

@@ -242,13 +242,15 @@ def sum_over(
     count: jax.Array, body: Callable[[jax.Array, Any], tuple[Any, Metrics]], carry: Any
 ) -> tuple[Any, Metrics]:
     """`count` times () `carry, terms = body(i, carry)`: the last carry, and the sums of the terms."""
+    body = jax.jit(body, inline=True)  # traced for the shapes of the terms, and not again in the loop
 
     def add(i: jax.Array, loop: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
         carry, terms = body(i, loop[0])
         return carry, jax.tree.map(jnp.add, loop[1], terms)
 
     shapes = jax.eval_shape(body, jnp.zeros((), jnp.int32), carry)[1]
-    return jax.lax.fori_loop(0, count, add, (carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)))
+    sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return jax.lax.fori_loop(np.int32(0), count, add, (carry, sums))  # of the type that `body` was traced for
 
 
 def credit_rates(config: DreamerConfig, num_envs: int) -> tuple[int, int]:

@@ -213,7 +213,7 @@ class _Run:
 
         self._compiled = compiled
         if options.eval_ahead is not None and mesh is None and self.env_steps < self.total_steps:
-            self._ready = in_thread(options.eval_ahead, jax.tree.map(jnp.copy, self.state.agent.acting))
+            self._ready = in_thread(options.eval_ahead, copied(self.state.agent.acting))
         options.announce(COMPILING)
         step = train_iteration if self._counted else pretrain.pretrain_iteration
         self._iterate = compiled(step) if early is None else early.result()
@@ -334,7 +334,7 @@ class _Run:
         if evaluated and jax.process_count() > 1:
             params = jax.device_get(self.state.agent.acting)  # they evaluate side by side, each on its own device
         elif evaluated:
-            params = jax.tree.map(jnp.copy, self.state.agent.acting)  # the next iteration donates its own
+            params = copied(self.state.agent.acting)  # the next iteration donates its own
         self._waiting.append((line, params))
         self._bar.show(self.env_steps, headline(line))
         return self._write_waiting(at_once)
@@ -357,6 +357,12 @@ class _Run:
             stop = self.options.stop
             stops = stops or (params is not None and stop is not None and stop(line))
         return stops
+
+
+@jax.jit
+def copied(params: Params) -> Params:
+    """Arrays of their own; one program copies them all."""
+    return jax.tree.map(jnp.copy, params)
 
 
 def in_thread(call: Callable[..., Any], *given: Any) -> Future:

@@ -31,7 +31,8 @@ class Sandwich:
 
     def variances(self, scores: np.ndarray) -> np.ndarray:
         """(N, P) diagonals of covariances, from scores (N, G, P)."""
-        return np.square(scores.swapaxes(0, 1) @ self.moves.swapaxes(1, 2)).sum(0)
+        moved = scores.swapaxes(0, 1) @ self.moves.swapaxes(1, 2)  # large: other memory would take longer than squaring
+        return np.square(moved, out=moved).sum(0)
 
 
 def sandwich(blocks: np.ndarray, inverse: np.ndarray) -> Sandwich:
@@ -204,4 +205,5 @@ def _flipped(
         signs = random.choice((-1.0, 1.0), (min(count, FLIPS - first), kind.label.max() + 1))
         drawn = signs[:, kind.label, None] * errors
         moved = drawn.sum((1, 2)) @ inverse
-        yield moved, drawn - np.einsum("bkpq,nq->nbkp", evidence.blocks, moved, optimize=True)
+        drawn -= np.einsum("bkpq,nq->nbkp", evidence.blocks, moved, optimize=True)
+        yield moved, drawn

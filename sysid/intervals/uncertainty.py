@@ -14,7 +14,7 @@ import numpy as np
 from sysid.errors.pose_objective import DriveResiduals, without_prior
 from sysid.errors.prior import UNKNOWN, expected_sd
 from sysid.errors.space import BENT, HUBER, NUISANCE, TERMS, Space, huber_weight, robust_cost
-from sysid.intervals.independence import CONFIDENCE, Information, errors_of, shared_error
+from sysid.intervals.independence import CONFIDENCE, Information, StandardErrors, errors_of, shared_error
 from sysid.logs.metrics import replicate_groups
 from sysid.search import least_squares
 from sysid.search.slopes import average_slopes, likely_by, products
@@ -54,6 +54,11 @@ class Uncertainty:
     quantile: np.ndarray  # (P,) standard errors that the intervals reach on either side
     evidence: Information
 
+    @property
+    def errors(self) -> StandardErrors:
+        """Those of the evidence, which are the same at any point."""
+        return StandardErrors(self.deviation, self.quantile, self.covariance)
+
     def spectrum(self) -> list[tuple[float, str]]:
         """Fisher information along each of its eigenvectors, weakest first, with the parameters that make it up."""
         names, found = [estimate.name for estimate in self.estimates], []
@@ -76,13 +81,16 @@ def estimate(
     `robust`: u minimises the Huber loss: residuals beyond its bend pull with a constant force and add no curvature.
     """
     found = _evidence_at(objective, u, robust)
-    return uncertainty_of(replace(found, ahead=_ahead(objective, found, robust)), objective.space, confidence)
+    errors = errors_of(found, confidence)
+    evidence = replace(found, ahead=_ahead(objective, found, errors, confidence, robust))
+    return uncertainty_of(evidence, objective.space, confidence, errors)
 
 
-def _ahead(objective: DriveResiduals, found: Information, robust: bool) -> np.ndarray:
+def _ahead(
+    objective: DriveResiduals, found: Information, errors: StandardErrors, confidence: float, robust: bool
+) -> np.ndarray:
     """(2, P) how many times as wide intervals of `BENT` parameters are from their lower and upper ends; 1 of others."""
-    space, u = objective.space, found.u
-    errors, ahead = errors_of(found), np.ones((2, space.size))
+    space, u, ahead = objective.space, found.u, np.ones((2, objective.space.size))
     reach, inverse = errors.quantile * errors.deviation, found.inverse
     over = likely_by(found.blocks.sum((0, 1)), found.variance)
     for index in np.flatnonzero([name in BENT for name in space.names]):
@@ -97,7 +105,7 @@ def _ahead(objective: DriveResiduals, found: Information, robust: bool) -> np.nd
             start[:, index] = u[index] + step
             there = least_squares.fit(objective, starts=np.clip(start, 0.0, 1.0), stop=least_squares.Stopping(FOLLOW),
                                       robust=robust, frozen=(space.names[index],)).u
-            known = errors_of(_evidence_at(objective, there, robust, over))
+            known = errors_of(_evidence_at(objective, there, robust, over), confidence)
             wide = known.quantile[index] * known.deviation[index] / reach[index]
             ahead[end, index] = 1.0 + (wide - 1.0) / share
     return ahead
@@ -138,9 +146,11 @@ def _evidence_at(objective: DriveResiduals, u: np.ndarray, robust: bool, over: n
     return replace(found, precision=np.eye(space.size) / PRIOR_SD**2 * found.scale, share=found.scale)
 
 
-def uncertainty_of(evidence: Information, space: Space, confidence: float = CONFIDENCE) -> Uncertainty:
-    """Intervals from the information of a log."""
-    u, errors = evidence.u, errors_of(evidence, confidence)
+def uncertainty_of(
+    evidence: Information, space: Space, confidence: float = CONFIDENCE, errors: StandardErrors | None = None
+) -> Uncertainty:
+    """Intervals from the information of a log; `errors` where those of this information are known already."""
+    u, errors = evidence.u, errors or errors_of(evidence, confidence)
     information, directions = np.linalg.eigh(evidence.blocks.sum((0, 1)) / evidence.scale)
     reach = errors.quantile * errors.deviation * np.array([[-1], [1]]) * stretched(evidence.ahead)  # (2, P)
     ends = space.to_values(u + reach)

@@ -115,7 +115,8 @@ def fit_log(
         sizes = chosen_sizes(chosen, objective.renewed(u), known, final_cost, config.parameters, robust)
         u, final_cost, stated = sizes.u, sizes.cost, sizes.names
         # What the drives say of stated sizes counts as well, and they say it where all are free.
-        known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space) if stated else known
+        if stated:
+            known = uncertainty.uncertainty_of(replace(known.evidence, u=u), space, errors=known.errors)
     objective = objective.renewed(u)  # its noise is reported
     values = jax.numpy.asarray(space.to_values(u), jax.numpy.result_type(float))
     fitted = models.set_parameters(given.params, space.names, values)

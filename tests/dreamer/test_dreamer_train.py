@@ -8,13 +8,14 @@ import time
 from random import Random
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from dreamer_toys import corridor_env, counting_env, tiny_config, train_without_end
 from filelock import FileLock
 
 from dreamer import checkpoint, iteration
-from dreamer.train import TrainingOptions, evaluate, train
+from dreamer.train import TrainingOptions, copied, evaluate, train
 
 ENV = corridor_env(4)
 CONFIG = tiny_config(lr=1e-3, train_ratio=64.0)
@@ -286,3 +287,30 @@ def test_several_steps_in_one_dispatch_are_the_same_run(straight):
         updates, episodes = updates + int(metrics["updates"]), episodes + float(metrics["episodes"])
     assert int(state.env_steps) == 400 and int(state.agent.updates) == updates == straight.updates
     assert episodes == sum(line["episodes"] for line in lines(straight.out))
+
+
+@pytest.mark.quick
+def test_what_a_sum_adds_up_is_traced_once():
+    """An update of the learner is such a body, and the larger part of what a training traces."""
+    traced = []
+
+    def body(i, carry):
+        traced.append(i)
+        return carry * 2, {"seen": carry, "index": i.astype(jnp.float32)}
+
+    carry, sums = jax.jit(lambda count, carry: iteration.sum_over(count, body, carry))(3, jnp.ones(2))
+    assert len(traced) == 1
+    np.testing.assert_array_equal(carry, [8, 8])
+    np.testing.assert_array_equal(sums["seen"], [7, 7])
+    assert sums["index"] == 3
+
+
+@pytest.mark.quick
+def test_parameters_are_copied_into_memory_of_their_own_by_one_program(programs):
+    params = {size: jnp.full(size, float(size)) for size in range(211, 216)}
+    programs.clear()
+    other = copied(params)
+    assert programs["cache_misses"] + programs["cache_hits"] == 1
+    for size, leaf in params.items():
+        leaf.delete()  # as a training that goes on does
+        np.testing.assert_array_equal(other[size], float(size))

@@ -274,6 +274,26 @@ def test_a_nuisance_is_never_told_and_its_interval_is_its_bounds():
 
 
 @pytest.mark.quick
+def test_errors_of_the_same_information_are_computed_once(monkeypatch):
+    """They take longest of all that intervals take; only the other end of a bent parameter has its own."""
+    asked = []
+
+    def counted(*given):
+        asked.append(independence.errors_of(*given))
+        return asked[-1]
+
+    monkeypatch.setattr(uncertainty, "errors_of", counted)
+    random = np.random.default_rng(5)
+    objective = Linear(designs(random), correlated(random, 0.5))
+    known = uncertainty.estimate(objective, least_squares.fit(objective, stop=least_squares.Stopping(4)).u)
+    assert len(asked) == 1
+    elsewhere = dataclasses.replace(known.evidence, u=known.evidence.u + 0.01)
+    again = uncertainty.uncertainty_of(elsewhere, objective.space, errors=known.errors)
+    assert len(asked) == 1
+    assert again.estimates == uncertainty.uncertainty_of(elsewhere, objective.space).estimates
+
+
+@pytest.mark.quick
 def test_an_interval_reaches_as_far_down_as_up_on_the_scale_on_which_it_is_told():
     """The wheels' inertia is a term of what drives tell, not a factor."""
     names = ("wheel_inertia.ratio", "torque_drive.kp")

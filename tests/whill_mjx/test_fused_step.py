@@ -15,11 +15,24 @@ from whill_mjx.vehicle import rigid
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.dynamics import drive, nominal_world, place
 from whill_mjx.vehicle.kinematics import rotation_from_quaternion
-from whill_mjx.vehicle.model import VehicleModel, build_model, mujoco_model, wheel_bodies
+from whill_mjx.vehicle.model import VehicleModel, WheelBodies, build_model, mujoco_model
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.scalars import apart, scan_apart
+from whill_mjx.vehicle.specs import SPECS
 
 quick = pytest.mark.quick
+
+
+def wheels_of(host):
+    left = host.body("left_wheel")
+    armature = host.dof_armature[host.joint("left_wheel").dofadr[0]]
+    return WheelBodies(left.pos[0], left.pos[1], left.mass[0], left.inertia[1], armature)
+
+
+@quick
+@pytest.mark.parametrize("name", SPECS)
+def test_the_wheels_are_bodies_as_mujoco_compiles_them(name):
+    assert build_model(SPECS[name]).wheels == wheels_of(mujoco_model(SPECS[name]))
 
 
 @quick
@@ -35,7 +48,7 @@ def test_accelerations_equal_those_of_c_mujoco_for_any_state_and_heavy_wheels(se
     data.qpos[:], data.qvel[:], data.qfrc_applied[:] = (random.normal(size=size) for size in (9, 8, 8))
     data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
     mujoco.mj_forward(host, data)
-    model = VehicleModel(spec, VehicleConfig(), host, wheel_bodies(host))
+    model = VehicleModel(spec, VehicleConfig(), wheels_of(host))
     with jax.enable_x64(True):
         mass, inertia, com, gravity, qpos, qvel, force = (
             jnp.asarray(np.array(value))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -21,6 +23,20 @@ from whill_mjx.tasks.tasks import TASKS, ObstacleCourse
 SHORT = ObstacleCourse(max_steps=4)
 SMALL = {"task": SHORT, "height": 8, "width": 8}
 STILL = np.array([0.0, 0.0], np.float32)
+FRESH = """
+import sys
+import gymnasium, jax
+import whill_mjx.gym
+compiled = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda name, seconds, **about: name.endswith("backend_compile_duration") and compiled.append(about.get("fun_name")))
+for seed in range(2):
+    env = gymnasium.make("WhillObstacleCourse-v0", height=8, width=8)
+    env.reset(seed=seed)
+    env.step(env.action_space.sample())
+    print(len(compiled))
+print("mujoco" in sys.modules, file=sys.stderr)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +105,14 @@ def test_environments_of_one_kind_share_what_is_compiled(env):
     other.step(STILL)  # from a state of a step, not of a reset
     assert env._kind.step._cache_size() == 1
     assert WhillEnv(task="obstacle_course", height=8, width=8)._kind is not env._kind
+
+
+def test_a_fresh_process_compiles_a_reset_and_a_step_and_a_further_environment_nothing():
+    """Each small program beside these two, such as one that makes a number an array, would cost a tenth of a second on
+    an accelerator."""
+    found = subprocess.run([sys.executable, "-c", FRESH], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["2", "2"]
+    assert found.stderr.split()[-1] == "False"  # our own step needs no MuJoCo, whose import takes as long
 
 
 def test_a_pickled_or_copied_environment_goes_on_where_it_was(env):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from whill_mjx.world.render import FIRST_BOX, GROUND, MARKER, SKY, pinhole, render, render_frame
+from whill_mjx.world.render.blocks import in_blocks
 from whill_mjx.world.render.visibility import reciprocal
 from whill_mjx.world.scene import Boxes, Marker, Scene, box, default_looks, no_boxes, stack_boxes
 
@@ -165,3 +166,20 @@ def test_images_are_drawn_inside_a_loop_of_many_instances():
     for index, place in enumerate((0.0, 0.3)):
         first = jax.jit(render)(jnp.array([place, 0.0, 1.0]), LEVEL, LENS, scene)
         np.testing.assert_array_equal(images[index, 0], first)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("images, traces", [((), 1), ((20,), 2)])
+def test_images_in_blocks_are_those_drawn_whole_and_are_traced_once_for_an_image_and_once_for_many(images, traces):
+    """Tracing the camera takes a tenth of a second, in each program that has one."""
+    traced = []
+
+    def function(rows, level):
+        traced.append(level)
+        return rows[:, None] * level + jnp.arange(3.0)
+
+    rows, level = jnp.arange(7.0), jnp.linspace(1.0, 2.0, 20).reshape(-1)[: max(images, default=1)].reshape(images)
+    drawn = in_blocks(function)
+    found = jax.jit(jax.vmap(drawn, (None, 0)) if images else drawn)(rows, level)
+    assert len(traced) <= traces
+    np.testing.assert_array_equal(found, rows[:, None] * level[..., None, None] + jnp.arange(3.0))

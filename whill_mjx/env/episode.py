@@ -173,7 +173,7 @@ def _control_period(
     ends["time_s"] = jnp.where(after.done, step_count * jnp.array(env.model.config.control_dt, float), 0.0)
     ends["episode_return"] = jnp.where(after.done, after.episode_return, 0.0)
     outcome = Outcome(reward, terminated, truncated, ends | pose_metrics(env, after) | event_metrics(after))
-    still = (state, first_outcome(env, state))  # after the end nothing moves, and the end is reported once
+    still = (state, first_outcome(env, state, ends))  # after the end nothing moves, and the end is reported once
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
 
 

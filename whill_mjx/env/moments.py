@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import jax
 import jax.numpy as jnp
 
@@ -76,11 +78,14 @@ def view_of(env: Env, params: VehicleParams, state: State) -> View:
     return View(env, params, state, moment_of(env, state, state.vehicle, state.command, state.step_count))
 
 
-def first_outcome(env: Env, state: State) -> Outcome:
-    """Outcome that goes with the first frame of an episode, and with every frame after its end."""
+def first_outcome(env: Env, state: State, names: Iterable[str] | None = None) -> Outcome:
+    """Outcome that goes with the first frame of an episode, and with every frame after its end.
+
+    `names` are those of `end_names`; None asks the task's endings, which JAX traces for that.
+    """
     false, zero = jnp.zeros((), bool), jnp.zeros(())
     nothing = jax.tree.map(jnp.zeros_like, event_metrics(state))
-    ends = dict.fromkeys(end_names(env, state), zero)
+    ends = dict.fromkeys(end_names(env, state) if names is None else names, zero)
     return Outcome(zero, false, false, ends | pose_metrics(env, state) | nothing)
 
 

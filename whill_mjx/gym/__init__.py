@@ -90,8 +90,8 @@ class WhillEnv(Carried, gymnasium.Env):
         check_process()
         condition = condition_of(options)
         super().reset(seed=seed)
-        key = jax.random.key(int(self.np_random.integers(2**31)))
-        self._state, time_step = self._kind.reset(key, condition)
+        number = np.uint32(self.np_random.integers(2**31))
+        self._state, time_step = self._kind.reset(number, condition)
         return self._shown(time_step), _info(time_step.metrics)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:

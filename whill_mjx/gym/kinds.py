@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,6 +23,7 @@ from whill_mjx.batch import BatchEnv, BatchState, make_batch
 from whill_mjx.env import EVENT_METRICS, POSE_METRICS, make_env, observe
 from whill_mjx.evaluation.conditions import NAMES, Condition, arranged, begin_under, nominal
 from whill_mjx.io.fields import CONDITION, check, shown
+from whill_mjx.io.garbage import undisturbed
 from whill_mjx.vehicle.types import TimeStep
 
 OPTIONS = tuple(name for name in NAMES if name != "latency" and not name.startswith("camera_"))
@@ -52,55 +53,55 @@ class Kind:
 
     @cached_property
     def reset(self) -> Any:
-        """(origin, condition or None) -> state and first time step of one instance."""
+        """(number () of the episode, condition or None) -> state and first time step of one instance."""
 
-        def begin(origin: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
-            return strong(self._begin_one(origin, condition))
+        def begin(number: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
+            return strong(self._begin_one(jax.random.key(number), condition))
 
-        return jax.jit(begin)
+        return _program(begin)
 
     @cached_property
     def step(self) -> Any:
         """(state, action) -> state and time step of one instance."""
-        return jax.jit(lambda state, action: strong(self.batch.step_one(state, action)))
+        return _program(lambda state, action: strong(self.batch.step_one(state, action)))
 
     @cached_property
     def reset_all(self) -> Any:
-        """(origins (N,), condition or None) -> state and first time steps."""
+        """(numbers (N,) of the episodes, condition or None) -> state and first time steps."""
 
-        def begin(origins: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
-            return strong(jax.vmap(lambda origin: self._begin_one(origin, condition))(origins))
+        def begin(numbers: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
+            return strong(jax.vmap(lambda number: self._begin_one(jax.random.key(number), condition))(numbers))
 
-        return jax.jit(begin)
+        return _program(begin)
 
     @cached_property
     def step_all(self) -> Any:
         """(state, actions (N, 2)) -> state and time steps; nothing begins anew."""
-        return jax.jit(lambda state, actions: strong(jax.vmap(self.batch.step_one)(state, actions)))
+        return _program(lambda state, actions: strong(jax.vmap(self.batch.step_one)(state, actions)))
 
     @cached_property
     def step_or_reset(self) -> Any:
         """(state, actions (N, 2)) -> state and time steps; instances that have ended begin a new episode instead."""
-        return jax.jit(lambda state, actions: strong(self.batch.step(state, actions)))
+        return _program(lambda state, actions: strong(self.batch.step(state, actions)))
 
     @cached_property
     def restart(self) -> Any:
-        """(state, time steps, mask (N,), origins (N,)) -> the same with new episodes where the mask is set."""
+        """(state, time steps, mask (N,), numbers (N,)) -> the same with new episodes where the mask is set."""
 
-        def begin(state: BatchState, steps: TimeStep, mask: jax.Array, origins: jax.Array):
-            fresh = jax.vmap(self.batch.begin_one)(origins)
+        def begin(state: BatchState, steps: TimeStep, mask: jax.Array, numbers: jax.Array):
+            fresh = jax.vmap(lambda number: self.batch.begin_one(jax.random.key(number)))(numbers)
 
             def choose(new: jax.Array, old: jax.Array) -> jax.Array:
                 return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
             return strong(jax.tree.map(choose, fresh, (state, steps)))
 
-        return jax.jit(begin)
+        return _program(begin)
 
     @cached_property
     def picture(self) -> Any:
         """State -> camera image (H, W, 3) uint8 of one instance."""
-        return jax.jit(lambda state: observe(self.batch.env, state.env))
+        return _program(lambda state: observe(self.batch.env, state.env))
 
     def _begin_one(self, origin: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
         if condition is None:
@@ -109,6 +110,11 @@ class Kind:
         return dataclasses.replace(self.batch, env=env).begin_one(
             origin, lambda params, state: begin_under(condition, env, params, state)
         )
+
+
+def _program(function: Callable[..., Any]) -> Any:
+    """`function` compiled; Python collects no garbage while JAX traces it."""
+    return jax.jit(undisturbed(function))
 
 
 def strong(tree: Any) -> Any:

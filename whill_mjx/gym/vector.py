@@ -95,16 +95,16 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
         mask = options.pop("reset_mask", None) if isinstance(options, dict) else None
         mask = None if mask is None else np.asarray(mask)
         condition = condition_of(options)
-        origins = self._origins(seed, mask)
+        numbers = self._numbers(seed, mask)
         if mask is None:
-            self._state, self._step = self._kind.reset_all(origins, condition)
+            self._state, self._step = self._kind.reset_all(numbers, condition)
             self._ended[:] = False
             return self._observed(self._step)
         if self._state is None:
             raise RuntimeError("reset with a reset_mask was called before reset; call reset() first.")
         if condition is not None:
             raise ValueError("reset_mask goes with no other option. Give either alone.")
-        self._state, self._step = self._kind.restart(self._state, self._step, mask, origins)
+        self._state, self._step = self._kind.restart(self._state, self._step, mask, numbers)
         self._ended[mask] = False
         return self._observed(self._step, mask)
 
@@ -135,7 +135,7 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
             last = jax.tree.map(lambda leaf, index=index: leaf[index], obs)
             named = {name: value[index].item() for name, value in now.items() if not name.startswith("_")}
             info = self._add_info(info, {"final_obs": last, "final_info": named}, int(index))
-        self._state, self._step = self._kind.restart(self._state, self._step, ended, self._origins(None, ended))
+        self._state, self._step = self._kind.restart(self._state, self._step, ended, self._numbers(None, ended))
         obs, now = self._observed(self._step)
         return obs, reward, terminated, truncated, {**now, **info}
 
@@ -147,8 +147,8 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
             return tuple(np.asarray(self._step.obs))
         return tuple(np.asarray(jax.vmap(self._kind.picture)(self._state)))
 
-    def _origins(self, seed: Any, mask: np.ndarray | None) -> jax.Array:
-        """(N,) keys of new episodes."""
+    def _numbers(self, seed: Any, mask: np.ndarray | None) -> np.ndarray:
+        """(N,) uint32 numbers of new episodes, which their random keys are made of."""
         count = self.num_envs
         if mask is not None:
             if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
@@ -169,7 +169,7 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
             if one is not None:
                 self._randoms[index] = gymnasium.utils.seeding.np_random(int(one))[0]
             numbers[index] = self._randoms[index].integers(2**31)
-        return jax.vmap(jax.random.key)(numbers)
+        return numbers
 
     def _observed(self, step: Any, mask: np.ndarray | None = None) -> tuple[Any, dict[str, Any]]:
         """Observations and info as arrays of the host."""

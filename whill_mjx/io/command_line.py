@@ -24,6 +24,7 @@ from types import FrameType
 from typing import Any
 
 from whill_mjx.io.compiled import keep_compiled
+from whill_mjx.io.garbage import search_seldom
 from whill_mjx.processor import keep_results_apart, share_results
 
 GRACE_S = 1.2
@@ -193,6 +194,7 @@ def run(
         check_options(chosen)
         (share_results if getattr(chosen, "shares_results", True) else keep_results_apart)()
         keep_compiled()
+        search_seldom()
         main(chosen)
 
 

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dreamer import checkpoint
 from dreamer.progress import Progress
-from dreamer.train import COMPILING, TrainingOptions, carry_out, in_thread
+from dreamer.train import COMPILING, TrainingOptions, carry_out, copied, in_thread
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
@@ -79,15 +78,16 @@ class _Run:
         options.announce("preparing the training: first worlds and parameters")
         total = np.int32(self.iterations)
         program = jax.jit(lambda state, total: iterate(self.env, self.config, total, state), donate_argnums=0)
-        shapes = jax.eval_shape(lambda: init_state(self.env, self.config, seed))
+        init = jax.jit(lambda seed: init_state(self.env, self.config, seed))
+        shapes = jax.eval_shape(init, np.int32(seed))
         early = in_thread(program.lower(shapes, total).compile)  # while the first state is made
-        self.state, self.wall_before = _first_state(self.env, self.config, self.out, seed)
+        self.state, self.wall_before = _first_state(init(np.int32(seed)), self.config, self.out)
         self.done = int(self.state.updates)
         self.logged = self.env_steps // options.eval_every
         _keep_lines(self.out / "metrics.jsonl", self.env_steps)
         ahead = options.eval_ahead if self.done < self.last else None
         options.announce(COMPILING)
-        self.ready = [] if ahead is None else [in_thread(ahead, jax.tree.map(jnp.copy, self.state.params))]
+        self.ready = [] if ahead is None else [in_thread(ahead, copied(self.state.params))]
         compiled = early.result()
         self.run = lambda state: compiled(state, total)
         options.announce(f"training; its program was ready after {time.monotonic() - self.began:.0f} s")
@@ -163,9 +163,8 @@ class _Run:
         return line
 
 
-def _first_state(env: Any, config: PpoConfig, out: Path, seed: int) -> tuple[PpoState, float]:
-    """State to start from and the time [s] already spent."""
-    state = jax.jit(lambda seed: init_state(env, config, seed))(np.int32(seed))
+def _first_state(state: PpoState, config: PpoConfig, out: Path) -> tuple[PpoState, float]:
+    """State to start from, a new one unless there is a checkpoint, and the time [s] already spent."""
     restored = checkpoint.restore(out / "checkpoints", state, config)
     return (state, 0.0) if restored is None else (restored[0], float(restored[1]["wall_s"]))
 

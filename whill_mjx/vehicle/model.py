@@ -1,22 +1,25 @@
-"""Builds the MuJoCo model of a vehicle once and keeps what compiled code needs of it."""
+"""The static part of a vehicle, and its MuJoCo model, which is built where it is asked for: our own step needs none."""
 
 from __future__ import annotations
 
 import io
+import xml.etree.ElementTree as ElementTree
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
-import mujoco
 import numpy as np
 
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import Body
+
+if TYPE_CHECKING:
+    import mujoco
 
 ASSET = Path(__file__).parents[1] / "assets" / "whill_cr.xml"
 CHASSIS = 1  # body ids, in the order of the asset
@@ -40,21 +43,19 @@ class WheelBodies:
 
 @dataclass(frozen=True, eq=False)
 class VehicleModel:
-    """Static part of a vehicle: spec, time steps and the MuJoCo model. Closed over by compiled functions."""
+    """Static part of a vehicle: spec, time steps and the bodies of its wheels. Closed over by compiled functions."""
 
     spec: VehicleSpec
     config: VehicleConfig
-    mujoco: mujoco.MjModel
-    """The model for C MuJoCo, with nominal mass."""
     wheels: WheelBodies
-    """The two driven wheels as bodies of that model."""
+    """The two driven wheels, as bodies of the MuJoCo model."""
 
     @cached_property
     def mjx(self) -> Any:
-        """The same for MJX (mjx.Model); made when first asked for, by dynamics "mjx"."""
+        """The vehicle with nominal mass for MJX (mjx.Model); made when first asked for, by dynamics "mjx"."""
         mjx = import_mjx()
         with jax.ensure_compile_time_eval():  # it may be asked for while tracing, and is kept
-            return mjx.put_model(self.mujoco)
+            return mjx.put_model(mujoco_model(self.spec, self.config))
 
     @cached_property
     def data(self) -> Any:
@@ -78,6 +79,8 @@ def mujoco_model(
 
     Without `body`: nominal mass, centre of mass at the origin, inertia of a box.
     """
+    import mujoco  # takes a tenth of a second, and a simulation does without it
+
     config = config or VehicleConfig()
     editable = mujoco.MjSpec.from_file(str(ASSET))
     editable.modelname = spec.name
@@ -109,14 +112,13 @@ def box_inertia(spec: VehicleSpec) -> tuple[float, float, float]:
 @lru_cache(maxsize=16)
 def build_model(spec: VehicleSpec, config: VehicleConfig | None = None) -> VehicleModel:
     """The static model of `spec`; built once per (spec, config)."""
-    config = config or VehicleConfig()
-    host = mujoco_model(spec, config)
-    return VehicleModel(spec, config, host, wheel_bodies(host))
+    return VehicleModel(spec, config or VehicleConfig(), wheel_bodies(spec))
 
 
-def wheel_bodies(host: mujoco.MjModel) -> WheelBodies:
-    """The driven wheels of a model from `mujoco_model`."""
-    left = host.body("left_wheel")
-    x, y, _ = (float(value) for value in left.pos)
-    armature = host.dof_armature[host.joint("left_wheel").dofadr[0]]
-    return WheelBodies(x, y, float(left.mass[0]), float(left.inertia[1]), float(armature))
+def wheel_bodies(spec: VehicleSpec) -> WheelBodies:
+    """The driven wheels as `mujoco_model` makes them: of the spec's geometry, with the asset's mass and inertia."""
+    inertial = ElementTree.parse(ASSET).find(".//body[@name='left_wheel']/inertial")
+    assert inertial is not None
+    mass, inertia = inertial.attrib["mass"], inertial.attrib["diaginertia"].split()[1]
+    numbers = (spec.reference_x, spec.track / 2, mass, inertia, spec.wheel_inertia)
+    return WheelBodies(*(float(number) for number in numbers))

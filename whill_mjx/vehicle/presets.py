@@ -27,7 +27,7 @@ from whill_mjx.effects.torque_drive import TorqueDrive
 from whill_mjx.effects.yaw_scrub import YawScrub
 from whill_mjx.vehicle.model import box_inertia
 from whill_mjx.vehicle.specs import GRAVITY, SPECS, VehicleSpec, find_spec
-from whill_mjx.vehicle.types import Body, VehicleParams
+from whill_mjx.vehicle.types import Body, VehicleParams, as_number
 
 SAG = 0.005 / 0.1325  # of a wheel's radius, under the weight at rest: the chair's
 SPARE = 1.5  # torque of a skid drive over that at which its wheels slide sideways (estimate)
@@ -118,7 +118,7 @@ def physical(spec: VehicleSpec) -> VehicleParams:
     middle = (spec.rear_x + spec.front_x) / 2
     com_x = middle if skid else middle + 0.4 * (spec.reference_x - middle)
     return VehicleParams(
-        replace(default_body(spec), com_x=jnp.asarray(com_x, jnp.result_type(float))),
+        replace(default_body(spec), com_x=as_number(com_x)),
         (
             with_values(CommandDelay, delay=0.02),
             with_values(
@@ -188,4 +188,4 @@ def default_body(spec: VehicleSpec) -> Body:
 
 def with_values(kind: type, **values: float) -> Any:
     """A `kind` (an effect or the body) with these values as arrays of the default float type."""
-    return kind(**{name: jnp.asarray(value, dtype=jnp.result_type(float)) for name, value in values.items()})
+    return kind(**{name: as_number(value) for name, value in values.items()})

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 
@@ -24,6 +25,11 @@ class Parameter:
 def parameter(unit: str, low: float, high: float, neutral: float, description: str = "") -> Any:
     """Field of a pytree of parameters: a scalar leaf, neutral by default, with its `Parameter` beside it."""
     return struct.field(default=neutral, metadata={"parameter": Parameter(unit, low, high, neutral, description)})
+
+
+def as_number(value: float) -> jax.Array:
+    """A number as an array of the default float type. NumPy converts it: JAX would compile a program for that."""
+    return jax.device_put(np.asarray(value, jnp.result_type(float)))
 
 
 def parameters_of(holder: Any) -> dict[str, Parameter]:

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from whill_mjx.effects import EFFECTS
 from whill_mjx.io import fields
@@ -29,7 +28,7 @@ from whill_mjx.io.formats import upgraded
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.presets import in_short, preset
 from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec, in_proportion
-from whill_mjx.vehicle.types import Body, VehicleParams, parameters_of
+from whill_mjx.vehicle.types import Body, VehicleParams, as_number, parameters_of
 
 SCHEMA = 1
 KIND = "micromobility-vehicle"
@@ -234,4 +233,4 @@ def _read_parameters(path: Path, holder: str, kind: Any, table: dict[str, Any], 
     missing = {name for name in set(known) - set(values) if f"{holder}.{name}" not in LATER}
     if missing:
         raise ValueError(f"{path}: {holder} lacks {', '.join(sorted(missing))}. Give a value and a unit for each.")
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), kind(**values))
+    return jax.tree.map(as_number, kind(**values))

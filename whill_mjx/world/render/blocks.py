@@ -60,7 +60,8 @@ def _assembled(block: Callable[[jax.Array], jax.Array], count: int, size: int) -
     def one_round(number: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         return write(carry[0], carry[1], number - 1), block(first(number))
 
-    like = jax.eval_shape(block, jnp.zeros((), jnp.int32))
+    block = jax.jit(block, inline=True)  # traced for its shape, and not again in the loop
+    like = jax.eval_shape(lambda: block(first(0)))
     empty = (jnp.zeros((count, *like.shape[1:]), like.dtype), jnp.zeros(like.shape, like.dtype))
     rounds = -(-count // size)
     whole, last = jax.lax.fori_loop(0, rounds, one_round, empty)
