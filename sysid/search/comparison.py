@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from sysid.errors.pose_objective import Objective, Replays
@@ -119,7 +118,7 @@ class Judge:
         simulated = self._replay.simulate(self._space.to_values(different))
         errors = []
         for k in range(len(different)):
-            one = predictions(self._trials, jax.tree.map(lambda leaf, k=k: leaf[k], simulated))
+            one = predictions(self._trials, simulated, k)
             channels = [score(trial, prediction) for trial, prediction in zip(self._trials, one, strict=True)]
             tables = [(found.get("ground_truth") or found["odometry"]).as_dict() for found in channels]
             known = [row["trajectory"] for row in tables if row["trajectory"] is not None]
