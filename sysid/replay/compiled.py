@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-_COMPILERS = ThreadPoolExecutor(4)
+COMPILERS = ThreadPoolExecutor(10)  # as many programs as a search has
 
 
 class Compiled:
@@ -35,7 +35,7 @@ class Compiled:
             kept = self._programs.get(key)
             if kept is None or (kept.done() and kept.exception()):  # what failed once is tried again
                 shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), arrays)
-                self._programs[key] = _COMPILERS.submit(self._compile, shapes, static)
+                self._programs[key] = COMPILERS.submit(self._compile, shapes, static)
             return self._programs[key]
 
     def __call__(self, *args: Any) -> Any:
