@@ -36,7 +36,8 @@ def text(found: Proposal, criterion: Criterion) -> str:
                  f"+-{after[index]:.1%}")
     lines.append(f"{'manoeuvre':18} {'sum of variances':>17} {'volume (log)':>13}   ({CRITERIA[criterion]} first)")
     lines += [f"{plan.candidate.name:18} {plan.trace:17.4f} {plan.volume:13.2f}" for plan in plans[:SHOWN]]
-    blind = blind_parameters(plans, space)
+    best = np.min([plan.deviation for plan in plans], axis=0)  # by any single candidate
+    blind = [name for name, one in zip(space.names, best, strict=True) if one > UNIDENTIFIABLE * PRIOR_SD]
     if blind:
         lines.append("no candidate determines: " + ", ".join(blind))
     return "\n".join(lines)
@@ -55,12 +56,6 @@ def in_words(name: str) -> str:
     whole = name.removesuffix("_50")
     said = MANOEUVRE_WORDS.get(whole, f"the {whole.replace('_', ' ')}") + (" at half size" if whole != name else "")
     return f"{said} ({name})"
-
-
-def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
-    """Parameters that no single candidate narrows well below their bounds."""
-    best = np.min([plan.deviation for plan in plans], axis=0)
-    return [name for name, deviation in zip(space.names, best, strict=True) if deviation > UNIDENTIFIABLE * PRIOR_SD]
 
 
 def write_page(path: Path, found: Proposal, limits: Limits, config: Any, about: dict[str, Parameter]) -> Path:

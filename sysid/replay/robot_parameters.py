@@ -125,7 +125,8 @@ def resolve(robot: Robot, path: str) -> Entry:
                              f"{kind}_NAME of mjx.Model). Correct {path!r}.")
         column = int(parts[-1]) if numbered else 0 if values.ndim > 1 else None
         if (kind, field) == ("body", "inertia") and not numbered:
-            column, unit = _upright(robot, ids[0]), "kg m^2"
+            upright = np.abs(robot.resting.ximat[ids[0]].reshape(3, 3)[2])  # of its principal axes, at rest
+            column, unit = int(upright.argmax()), "kg m^2"
     rows = [int(host.jnt_dofadr[one]) for one in ids] if array.startswith("dof_") else ids
     servo: tuple[int, ...] = ()
     if array == "actuator_gainprm" and column == 0:
@@ -138,11 +139,6 @@ def resolve(robot: Robot, path: str) -> Entry:
     if array == "actuator_forcerange" and not host.actuator_forcelimited[list(ids)].all():
         raise ValueError(f"{robot.path}: {path} has no limit in the file. Give the actuator a forcerange.")
     return entry
-
-
-def _upright(robot: Robot, body: int) -> int:
-    """Principal axis of a body that is the most upright at rest."""
-    return int(np.abs(robot.resting.ximat[body].reshape(3, 3)[2]).argmax())
 
 
 def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
