@@ -141,9 +141,6 @@ class Objective:
         """What an accelerator computes of the residuals by itself."""
         return make_equations(self)
 
-    def with_noise(self, noise: Noise) -> Objective:
-        return replace(self, noise=noise)
-
     def simulate(self, u: np.ndarray) -> Simulated:
         """Replay at unit coordinates (N, P)."""
         return self.replay.simulate(self.space.to_values(u))
@@ -194,10 +191,10 @@ class Objective:
     def renewed(self, u: np.ndarray) -> Objective:
         """The same with the noise that u (P,) leaves, where it was not known."""
         if self.noise.source == "defaults":
-            return self.with_noise(self.residual_noise(u))
+            return replace(self, noise=self.residual_noise(u))
         if self._rates is None:
             return self
-        return self.with_noise(replace(self.noise, gyro=self.residual_noise(u).gyro))
+        return replace(self, noise=replace(self.noise, gyro=self.residual_noise(u).gyro))
 
     def pieces(self, count: int) -> np.ndarray:
         """(K,) in which of so many pieces of its drive each residual is, errors of starts apart."""

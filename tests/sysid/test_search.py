@@ -175,7 +175,7 @@ def test_a_wrong_start_pose_is_absorbed_only_as_far_as_its_noise_allows(objectiv
     solved = unicycle_objective(tuple(moved))
     strict = unicycle_objective(tuple(
         dataclasses.replace(trial, start=dataclasses.replace(trial.start, yaw_sigma=1e-9)) for trial in moved))
-    base, absorbed, ignored = (one.with_noise(objective.noise).weighted_cost(U_TRUTH[None])[0]
+    base, absorbed, ignored = (dataclasses.replace(one, noise=objective.noise).weighted_cost(U_TRUTH[None])[0]
                                for one in (objective, solved, strict))
     assert absorbed < base + 0.1 < ignored - 1.0
 
