@@ -132,7 +132,6 @@ class Objective:
         return self.noise.pose, self.noise.odometry, self.prior, self.noise.gyro
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> Objective:
-        """The same with other `arrays`."""
         noise = replace(self.noise, pose=arrays[0], odometry=arrays[1], gyro=arrays[3])
         return replace(self, noise=noise, prior=arrays[2])
 

@@ -28,7 +28,6 @@ RESAMPLES = 2000
 
 
 def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
-    """Replays of trials by a vehicle."""
     drives, values = drives_of(result, trials, vehicle)
     return predictions(trials, drives.replay(values[None]), 0)
 

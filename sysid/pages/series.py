@@ -27,8 +27,6 @@ AGAIN = "Fit again; without the file, the trials are replayed."
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel of one trial."""
-
     t: np.ndarray  # (T,) s
     values: dict[str, np.ndarray]  # "measured" and the names of replays -> (T, 3) or (T, 5)
 
@@ -45,8 +43,6 @@ class Channel:
 
 @dataclass(frozen=True)
 class TrialSeries:
-    """All channels of one trial."""
-
     name: str
     held_out: bool
     start: tuple[float, float, float]  # x, y [m], yaw [rad] in the room

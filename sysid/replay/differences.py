@@ -177,7 +177,6 @@ class DifferenceReplay:
         self.replay.compile(self.space.size, trials)
 
     def simulate(self, values: np.ndarray) -> Simulated:
-        """As that of the replay."""
         return self.replay.simulate(values)
 
     def traced(self, values: jax.Array) -> Simulated:

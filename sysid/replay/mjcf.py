@@ -182,7 +182,6 @@ class Stepped:
         self.wheels = np.array(robot.wheels)
 
     def plant(self) -> Plant:
-        """The functions."""
         return Plant(self.place, self.substep, self.observe, float(self.robot.host.opt.timestep), self.move)
 
     def place(self, params: Parameters, start: jax.Array) -> Motion:

@@ -43,8 +43,6 @@ LIMITS = ("actuator_forcerange", "jnt_actfrcrange")  # the same either way
 
 @dataclass(frozen=True)
 class Entry:
-    """Where a parameter stands in the model."""
-
     path: str
     array: str
     rows: tuple[int, ...]
@@ -142,7 +140,6 @@ def resolve(robot: Robot, path: str) -> Entry:
 
 
 def names_of(host: mujoco.MjModel, kind: str) -> dict[str, int]:
-    """Elements of a kind by name."""
     count = {"body": host.nbody, "geom": host.ngeom, "joint": host.njnt, "actuator": host.nu}[kind]
     found = {mujoco.mj_id2name(host, KINDS[kind], i): i for i in range(count)}
     return {name: i for name, i in found.items() if name and name != "world"}

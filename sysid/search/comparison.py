@@ -37,7 +37,6 @@ class Recorder:
         self.best: list[tuple[int, float, float, np.ndarray]] = []
 
     def simulate(self, values: np.ndarray) -> Simulated:
-        """As that of the replay."""
         found = self._replay.simulate(values)
         self._record(values, found, len(values))
         return found

@@ -177,8 +177,6 @@ def choose(
 
 @dataclass(frozen=True)
 class Problem:
-    """What a search is given."""
-
     plant: Plant
     params: Any  # where it starts
     space: Space
