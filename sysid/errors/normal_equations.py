@@ -15,8 +15,7 @@ import numpy as np
 
 from sysid.errors.space import STEP, huber_weight, robust_cost
 from sysid.replay.arrays import Quotients
-from sysid.replay.compiled import COMPILERS, Compiled
-from sysid.replay.cores import on_processor
+from sysid.replay.cores import COMPILERS, Compiled, on_processor
 
 DRIVES = 32768  # replayed by one call, as near as sets allow: an accelerator takes as long for a few
 STATES = 2**27  # states recorded by one call at most: 5 GB, several times as much with what is made of them

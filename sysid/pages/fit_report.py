@@ -196,7 +196,7 @@ def _twin_note(log: Log, replays: Sequence[Prediction], fitted: Sequence[Predict
 def _distance(trial: Trial, replay: Prediction) -> float:
     """Position error against the outside pose, or else against the odometry [m]."""
     found = score(trial, replay)
-    return float(found["ground_truth" if trial.ground_truth is not None else "odometry"].trajectory or 0.0)
+    return float(found["ground_truth" if trial.ground_truth is not None else "odometry"]["trajectory"] or 0.0)
 
 
 SCALE = "odometry_scale.angular"

@@ -43,7 +43,7 @@ def error_rows(trials: tuple[Trial, ...], initial: list[Prediction], fitted: lis
     for trial, before, after in zip(trials, initial, fitted, strict=True):
         scores = [score(trial, prediction) for prediction in (ideal_replay(trial), before, after)]
         for channel in scores[0]:
-            tables = [one[channel].as_dict() for one in scores]
+            tables = [one[channel] for one in scores]
             metrics = {metric: dict(zip(REPLAYS, (table[metric] for table in tables), strict=True))
                        for metric in METRICS if tables[0][metric] is not None}
             rows.append({"trial": trial.name, "manoeuvre": trial.manoeuvre, "group": trial.group,

@@ -18,8 +18,7 @@ import numpy as np
 
 from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial
 from sysid.replay.arrays import quaternion_product
-from sysid.replay.compiled import Compiled
-from sysid.replay.cores import on_all_cores, on_processor
+from sysid.replay.cores import Compiled, on_all_cores, on_processor
 from sysid.replay.delays import delay_apart
 from sysid.replay.one_drive import (
     IN_ONE,

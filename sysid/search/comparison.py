@@ -119,7 +119,7 @@ class Judge:
         for k in range(len(different)):
             one = predictions(self._trials, simulated, k)
             channels = [score(trial, prediction) for trial, prediction in zip(self._trials, one, strict=True)]
-            tables = [(found.get("ground_truth") or found["odometry"]).as_dict() for found in channels]
+            tables = [found.get("ground_truth") or found["odometry"] for found in channels]
             known = [row["trajectory"] for row in tables if row["trajectory"] is not None]
             errors.append(np.mean(known) if known else np.nan)
         return np.array(errors)[back.reshape(-1)]

@@ -10,7 +10,7 @@ from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
 
 from sysid.errors.bin_objective import FeatureObjective, make_features_objective
 from sysid.errors.pose_objective import Objective, estimate_noise
-from sysid.replay.compiled import Compiled
+from sysid.replay.cores import Compiled
 from sysid.replay.differences import FEW, MANY, VECTOR, CourseReplay, DifferenceReplay, make_courses, rows_of_call
 from sysid.replay.models import with_effects
 from sysid.replay.rollout import PathReplay, Replay, make_batch

@@ -241,7 +241,7 @@ def test_the_papers_cost_is_the_sum_of_the_position_rmse(objective):
     u = np.array([[0.3, 0.4, 0.5]])
     simulated = objective.simulate(u)
     one = type(simulated)(simulated.pose[0], simulated.odometry[0], simulated.diverged[0])
-    errors = [score(trial, prediction)["ground_truth"].trajectory
+    errors = [score(trial, prediction)["ground_truth"]["trajectory"]
               for trial, prediction in zip(objective.trials, predictions(objective.trials, one), strict=True)]
     assert objective.paper_cost(u)[0] == pytest.approx(sum(errors), rel=1e-4)
 
