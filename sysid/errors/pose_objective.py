@@ -20,6 +20,7 @@ from sysid.errors.normal_equations import NormalEquations, make_equations, summe
 from sysid.errors.prior import Prior
 from sysid.errors.space import Residuals, Space, huber_weight
 from sysid.logs.metrics import replicate_noise
+from sysid.logs.planar import turned_by
 from sysid.logs.records import Trial
 from sysid.replay.arrays import added, namespace
 from sysid.replay.cores import on_processor
@@ -211,8 +212,7 @@ class Objective:
         sizes = [table[0].size for table in tables]
         pose = residual[:, : sizes[0]].reshape(tables[0].shape)
         yaw = np.array([trial.start.yaw for trial in self.trials])[:, None]
-        x, y = pose[..., 0], pose[..., 1]
-        turned = [np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, pose[..., 2]]
+        turned = [*turned_by(pose[..., 0], pose[..., 1], -yaw), pose[..., 2]]
         end = sum(sizes) + (0 if self._rates is None else self._rates[1].shape[1])
         return np.concatenate([*turned, residual[:, sizes[0] : end]], axis=1)
 

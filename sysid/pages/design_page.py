@@ -12,6 +12,7 @@ from sysid.errors.space import Space
 from sysid.intervals.design import Criterion, Plan, Proposal
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
+from sysid.logs.planar import turned_by
 from sysid.pages.loop_words import MANOEUVRE_WORDS
 from whill_mjx.io.html import Cell, Section, charts, explained, html_page, paragraph, table
 from whill_mjx.io.svg import PALETTE, Axes, Line, line_chart
@@ -98,8 +99,8 @@ def write_page(path: Path, found: Proposal, limits: Limits, config: Any, about: 
 
 def _room_chart(plan: Plan, limits: Limits) -> str:
     x0, y0, yaw = plan.start
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    x, y = x0 + cos * plan.path[:, 0] - sin * plan.path[:, 1], y0 + sin * plan.path[:, 0] + cos * plan.path[:, 1]
+    along, across = turned_by(plan.path[:, 0], plan.path[:, 1], yaw)
+    x, y = x0 + along, y0 + across
     (length, width), margin = limits.room, limits.margin
     outer = Line(np.array([0, length, length, 0, 0.0]), np.array([0, 0, width, width, 0.0]), colour=PALETTE[6])
     inner = Line(np.array([margin, length - margin, length - margin, margin, margin]),

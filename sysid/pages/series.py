@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.metrics import CHANNELS, ideal_replay
+from sysid.logs.planar import turned_by
 from sysid.logs.records import Prediction, Trial
 from whill_mjx.io.folders import whole_file
 from whill_mjx.io.reading import read_arrays
@@ -34,9 +35,7 @@ class Channel:
         """Replayed minus measured (T, C); position along and left of the measured heading, yaw as an angle."""
         measured = self.values["measured"]
         error = self.values[replay] - measured
-        cos, sin = np.cos(measured[:, 2]), np.sin(measured[:, 2])
-        x, y = error[:, 0].copy(), error[:, 1].copy()
-        error[:, 0], error[:, 1] = cos * x + sin * y, -sin * x + cos * y
+        error[:, 0], error[:, 1] = turned_by(error[:, 0], error[:, 1], -measured[:, 2])
         error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
         return error
 
