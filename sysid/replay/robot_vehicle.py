@@ -21,9 +21,8 @@ import numpy as np
 from sysid.replay.models import Parameters, Twin, describe_parameters, with_effects
 from sysid.replay.robot import Robot
 from sysid.replay.robot_contacts import parts, tyre_places
-from sysid.replay.robot_parameters import Entry, Overlaid
+from sysid.replay.robot_parameters import Entry, Overlaid, Size
 from sysid.replay.robot_servos import ROTOR_SHARE
-from sysid.replay.robot_sizes import Size
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import in_short, preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
