@@ -13,8 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sysid.replay.arrays import moved
-
 LENGTH = 2.75  # s, of a piece
 OVERLAP = 2.0
 """Time that is replayed before each [s]: whitened motion differs by 0.2 of its noise (0.05 with 3 s, 0.3 with 1.5 s).
@@ -55,7 +53,11 @@ def record(
     whole = [paths[0], *paths[1:, 1:]]
     for columns, at in poses:
         for piece in range(pieces):
-            path = moved(whole[piece][:, columns], paths[piece, 0, columns], at)
-            whole[piece] = whole[piece].at[:, columns].set(path)
-            at = path[-1]
+            first = paths[piece, 0, columns]
+            turn = at[2] - first[2]
+            cos, sin = jnp.cos(turn), jnp.sin(turn)
+            x, y, yaw = (whole[piece][:, columns] - first).T
+            moved = jnp.stack([at[0] + cos * x - sin * y, at[1] + sin * x + cos * y, at[2] + yaw], axis=-1)
+            whole[piece] = whole[piece].at[:, columns].set(moved)
+            at = moved[-1]
     return jnp.concatenate(whole)[: records + 1]
