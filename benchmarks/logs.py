@@ -180,7 +180,7 @@ def fitted_error(robot: Robot, drives: list[Drive]) -> float:
             return float("nan")
         trials = load_any(whole).trials
         _, replayed = predict(fit, trials)
-        errors = [score(trial, one)["ground_truth"].trajectory for trial, one in zip(trials, replayed, strict=True)]
+        errors = [score(trial, one)["ground_truth"]["trajectory"] for trial, one in zip(trials, replayed, strict=True)]
     return float(np.mean([error for error in errors if error is not None]))
 
 

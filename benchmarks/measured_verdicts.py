@@ -78,8 +78,8 @@ def errors(trials: tuple[Trial, ...], seen: list[Prediction]) -> dict[str, list[
     found = {}
     for trial, one in zip(trials, seen, strict=True):
         mine = score(trial, one)["ground_truth"]
-        assert mine.trajectory is not None and mine.yaw is not None
-        found[trial.name] = [mine.trajectory, mine.yaw]
+        assert mine["trajectory"] is not None and mine["yaw"] is not None
+        found[trial.name] = [mine["trajectory"], mine["yaw"]]
     return found
 
 

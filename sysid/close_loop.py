@@ -43,8 +43,6 @@ OUTPUTS = ("next_command.csv", "method.html", "evidence.json", "steps")
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """Command line of `python -m sysid.close_loop`."""
-
     dataset: Path
     """Folder with the drives in question."""
     reference: tuple[Path, ...] = ()
@@ -114,7 +112,6 @@ def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(Arguments, main, __doc__, stopped=command_line.STOPPED)
 
 

@@ -87,7 +87,6 @@ def dataset_folder(out: Path) -> Iterator[None]:
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(ConvertConfig, main, __doc__)
 
 

@@ -36,8 +36,6 @@ from whill_mjx.vehicle.specs import VehicleSpec
 
 @dataclass(frozen=True)
 class DesignConfig:
-    """Options of the command."""
-
     vehicle: str
     """Built-in vehicle, vehicle file, or the folder of a fit."""
     out: Path = Path("runs/command.csv")
@@ -149,7 +147,6 @@ def load_subject(name: str) -> Subject:
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(DesignConfig, main, __doc__)
 
 

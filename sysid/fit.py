@@ -39,8 +39,6 @@ OUTPUTS = ("series.npz", "model.toml", "model.xml", "trajectories.png", "yaw.png
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments(command_line.OwnModels, FitConfig):
-    """Command line of `python -m sysid.fit`."""
-
     dataset: Path
     """Folder with the driving log."""
 
@@ -111,7 +109,6 @@ def check_storage(settings: FitConfig) -> None:
 
 
 def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None) -> None:
-    """Fit, write and print the summary."""
     for note in log.notes:
         print(note)
     data = Loaded(log, arguments.dataset, {"train": arguments.train, "held_out_selection": arguments.held_out})
@@ -133,7 +130,6 @@ def fit(arguments: Arguments, settings: FitConfig, log: Log, model: Model | None
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(Arguments, main, __doc__, stopped=command_line.STOPPED)
 
 

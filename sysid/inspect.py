@@ -38,8 +38,6 @@ OUTPUTS = ("inspect.txt", "inspect.json", "inspect.png", "next_1.csv", "next_2.c
 
 @dataclass(frozen=True)
 class InspectConfig:
-    """Options of the command."""
-
     dataset: Path
     """Folder of a dataset, of DRIVE runs or of MRCLAM; or a robot file."""
     select: tuple[str, ...] = ()
@@ -151,7 +149,6 @@ def look(config: InspectConfig, log: Log) -> tuple[dict[str, Any], list[NextDriv
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(InspectConfig, main, __doc__)
 
 

@@ -103,7 +103,6 @@ def main(config: PaperConfig) -> dict[str, Any]:
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(PaperConfig, main, __doc__, stopped=command_line.STOPPED)
 
 

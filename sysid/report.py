@@ -18,14 +18,11 @@ from whill_mjx.io.folders import check_place, lock_folder
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the command."""
-
     run: Path
     """Folder that sysid.fit wrote."""
 
 
 def main(options: Options) -> None:
-    """Write the page."""
     with refusing():
         refuse_recording(options.run, "the folder that sysid.fit wrote.")
         read_report(options.run)
@@ -35,7 +32,6 @@ def main(options: Options) -> None:
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(Options, main, "Write the page RUN/report.html of an earlier fit.")
 
 

@@ -125,7 +125,6 @@ def _headline(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def cli() -> None:
-    """Command line."""
     command_line.run(Arguments, main, __doc__)
 
 

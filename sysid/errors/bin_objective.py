@@ -95,7 +95,6 @@ class FeatureObjective:
         return self.target, self.mask, filters.scale, coefficients, filters.inverse, self.prior
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> FeatureObjective:
-        """The same with other `arrays`."""
         return replace(self, target=arrays[0], mask=arrays[1], whitener=Whitener(*arrays[2:5]), prior=arrays[5])
 
     @cached_property

@@ -75,7 +75,6 @@ class Features:
 
 
 def channel_names(count: int) -> tuple[str, ...]:
-    """Names of so many channels."""
     return (*CHANNELS, GYRO)[:count]
 
 

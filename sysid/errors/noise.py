@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from sysid.logs.floor import last_change
 from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
 from sysid.replay.arrays import added, namespace
@@ -222,12 +223,8 @@ def noise_levels(ours: NoisyDrives, theirs: NoisyDrives, channels: Sequence[str]
 
 def steady_bins(trial: Trial, bins: int, width: float) -> np.ndarray:
     """(K,) bool: bins in which the commands have been constant for a while."""
-    table = trial.command.table
-    moved = np.abs(np.diff(table[:, 1:], axis=0)).max(1, initial=0.0) > 0
-    changes = np.concatenate([[0.0], table[1:, 0][moved]])
     end = (np.arange(bins) + 1) * width
-    last = changes[np.maximum(np.searchsorted(changes, end - 1e-6) - 1, 0)]
-    return np.asarray(end - width - last >= SETTLED - 1e-6)
+    return np.asarray(end - width - last_change(trial.command, end - 1e-6) >= SETTLED - 1e-6)
 
 
 def said(levels: Mapping[str, Mapping[str, Any]], alone: bool) -> str:

@@ -7,7 +7,6 @@ a cost, a gradient and a Hessian of each set come back.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -16,56 +15,43 @@ import numpy as np
 
 from sysid.errors.space import STEP, huber_weight, robust_cost
 from sysid.replay.arrays import Quotients
-from sysid.replay.cores import on_processor
+from sysid.replay.cores import COMPILERS, Compiled, on_processor
 
 DRIVES = 32768  # replayed by one call, as near as sets allow: an accelerator takes as long for a few
 STATES = 2**27  # states recorded by one call at most: 5 GB, several times as much with what is made of them
 SEARCHES, FEW = 32, 8
 """Sets whose gradients and Hessians are made together: as many at least as a search has starts, or few go on."""
-_COMPILERS = ThreadPoolExecutor(10)  # as many functions as a search has
 
 
-class Sums:
-    """Compiled sums over the residuals of an objective, which all objectives of its class and replay share."""
+def sums_over(objective: Any) -> dict[str, Compiled]:
+    """Sums over the residuals of many sets, "cost" and "quadratic", which all objectives of a class and replay share.
 
-    def __init__(self, objective: Any):
-        """`objective`: `Objective` or `FeatureObjective`; its `arrays` are what those of the same replay differ in."""
-        def residual(u: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
-            """White residuals (B, K) of one set (P,), and the replays (B,) that diverged."""
-            one = objective.with_arrays(arrays)
-            with jax.default_matmul_precision("highest"):
-                simulated = one.replay.traced(one.space.to_values(u[None]))
-                return one.residuals(u[None], simulated)[0], one.bad(simulated)[0]
+    `objective`: `Objective` or `FeatureObjective`; its `arrays` are what those of the same replay differ in.
+    """
+    def residual(u: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
+        """White residuals (B, K) of one set (P,), and the replays (B,) that diverged."""
+        one = objective.with_arrays(arrays)
+        with jax.default_matmul_precision("highest"):
+            simulated = one.replay.traced(one.space.to_values(u[None]))
+            return one.residuals(u[None], simulated)[0], one.bad(simulated)[0]
 
-        def cost(u: jax.Array, arrays: Any, robust: jax.Array) -> jax.Array:
-            return robust_cost(residual(u, arrays)[0], robust)
+    def cost(u: jax.Array, arrays: Any, robust: jax.Array) -> jax.Array:
+        return robust_cost(residual(u, arrays)[0], robust)
 
-        def quadratic(u: jax.Array, arrays: Any, robust: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            size = u.shape[0]
-            pairs = Quotients.central(u, STEP)
-            white, bad = jax.vmap(residual, (0, None))(jnp.concatenate([u[None], pairs.points]), arrays)
-            slope = pairs.slopes(white[1 : 1 + size], white[1 + size :])  # (B, K, P)
-            lost = bad[:1] | bad[1 : 1 + size] | bad[1 + size :]
-            slope = jnp.where(lost.T[:, None] | ~jnp.isfinite(slope), 0.0, slope)
-            weight = jnp.where(robust, huber_weight(white[0]), 1.0)
-            with jax.default_matmul_precision("highest"):
-                gradient = jnp.einsum("bkp,bk->p", slope, white[0] * weight)
-                hessian = jnp.einsum("bkp,bkq->pq", slope, slope * weight[..., None])
-            return robust_cost(white[0], robust), gradient, hessian
+    def quadratic(u: jax.Array, arrays: Any, robust: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        size = u.shape[0]
+        pairs = Quotients.central(u, STEP)
+        white, bad = jax.vmap(residual, (0, None))(jnp.concatenate([u[None], pairs.points]), arrays)
+        slope = pairs.slopes(white[1 : 1 + size], white[1 + size :])  # (B, K, P)
+        lost = bad[:1] | bad[1 : 1 + size] | bad[1 + size :]
+        slope = jnp.where(lost.T[:, None] | ~jnp.isfinite(slope), 0.0, slope)
+        weight = jnp.where(robust, huber_weight(white[0]), 1.0)
+        with jax.default_matmul_precision("highest"):
+            gradient = jnp.einsum("bkp,bk->p", slope, white[0] * weight)
+            hessian = jnp.einsum("bkp,bkq->pq", slope, slope * weight[..., None])
+        return robust_cost(white[0], robust), gradient, hessian
 
-        self._functions = {"cost": jax.jit(jax.vmap(cost, in_axes=(0, None, None))),
-                           "quadratic": jax.jit(jax.vmap(quadratic, in_axes=(0, None, None)))}
-        self.compiled: dict[Any, Future[Any]] = {}
-
-    def compile(self, name: str, size: int, parameters: int, arrays: Any) -> Future[Any]:
-        """The function for so many sets, compiled in a thread of its own."""
-        leaves, structure = jax.tree.flatten(arrays)
-        key = name, size, structure, tuple(leaf.shape for leaf in leaves)
-        if key not in self.compiled:
-            u = jax.ShapeDtypeStruct((size, parameters), jnp.result_type(float))
-            self.compiled[key] = _COMPILERS.submit(
-                lambda: self._functions[name].lower(u, arrays, np.bool_(False)).compile())
-        return self.compiled[key]
+    return {one.__name__: Compiled(jax.vmap(one, in_axes=(0, None, None))) for one in (cost, quadratic)}
 
 
 class NormalEquations:
@@ -75,15 +61,16 @@ class NormalEquations:
         """`at_once` is the number of sets that are replayed together."""
         compiled = objective.replay.compiled
         if type(objective) not in compiled:
-            compiled[type(objective)] = Sums(objective)
-        self.sums: Sums = compiled[type(objective)]
+            compiled[type(objective)] = sums_over(objective)
+        self.sums: dict[str, Compiled] = compiled[type(objective)]
         self._arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(float)), objective.arrays)
         parameters = objective.space.size
         many = max(at_once // (2 * parameters + 1), min(at_once, SEARCHES))
         self.sizes = {"cost": (at_once,), "quadratic": (min(FEW, many), many)}
-        # A search needs all of them: they are compiled side by side.
-        self._compiled = {(name, size): self.sums.compile(name, size, parameters, self._arrays)
-                          for name, sizes in self.sizes.items() for size in sizes}
+        for name, sizes in self.sizes.items():  # a search needs all of them: they are compiled side by side
+            for size in sizes:
+                u = jax.ShapeDtypeStruct((size, parameters), jnp.result_type(float))
+                self.sums[name].compile(u, self._arrays, np.bool_(False))
 
     def costs(self, u: np.ndarray, robust: bool = False) -> np.ndarray:
         """Sum (N,) of squares, or of the Huber loss, at unit coordinates (N, P)."""
@@ -97,10 +84,9 @@ class NormalEquations:
         """What a function gives for each of u (N, P), so many of them at a time; the last call is filled up."""
         sizes = self.sizes[name]
         size = next((size for size in sizes if size >= len(u)), sizes[-1])
-        function = self._compiled[name, size].result()
         padded = np.concatenate([u, np.repeat(u[-1:], -len(u) % size, axis=0)])
-        parts = [function(jnp.asarray(padded[i : i + size], jnp.result_type(float)), self._arrays, np.bool_(robust))
-                 for i in range(0, len(padded), size)]
+        sets = [jnp.asarray(padded[i : i + size], jnp.result_type(float)) for i in range(0, len(padded), size)]
+        parts = [self.sums[name](one, self._arrays, np.bool_(robust)) for one in sets]
         return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf, float) for leaf in leaves])[: len(u)],
                             *parts)
 
@@ -113,7 +99,7 @@ def summed_there(replay: Any) -> bool:
 def compile_ahead(objectives: Sequence[Any], replay: Any, values: np.ndarray) -> None:
     """Compile side by side what a search by these objectives needs of a replay with values (P,), on an accelerator."""
     if summed_there(replay):
-        _COMPILERS.submit(replay.simulate, values[None])
+        COMPILERS.submit(replay.simulate, values[None])
         for objective in objectives:
             _ = objective.equations
 

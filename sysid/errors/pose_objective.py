@@ -20,6 +20,7 @@ from sysid.errors.normal_equations import NormalEquations, make_equations, summe
 from sysid.errors.prior import Prior
 from sysid.errors.space import Residuals, Space, huber_weight
 from sysid.logs.metrics import replicate_noise
+from sysid.logs.planar import turned_by
 from sysid.logs.records import Trial
 from sysid.replay.arrays import added, namespace
 from sysid.replay.cores import on_processor
@@ -132,7 +133,6 @@ class Objective:
         return self.noise.pose, self.noise.odometry, self.prior, self.noise.gyro
 
     def with_arrays(self, arrays: tuple[Any, ...]) -> Objective:
-        """The same with other `arrays`."""
         noise = replace(self.noise, pose=arrays[0], odometry=arrays[1], gyro=arrays[3])
         return replace(self, noise=noise, prior=arrays[2])
 
@@ -140,9 +140,6 @@ class Objective:
     def equations(self) -> NormalEquations | None:
         """What an accelerator computes of the residuals by itself."""
         return make_equations(self)
-
-    def with_noise(self, noise: Noise) -> Objective:
-        return replace(self, noise=noise)
 
     def simulate(self, u: np.ndarray) -> Simulated:
         """Replay at unit coordinates (N, P)."""
@@ -194,10 +191,10 @@ class Objective:
     def renewed(self, u: np.ndarray) -> Objective:
         """The same with the noise that u (P,) leaves, where it was not known."""
         if self.noise.source == "defaults":
-            return self.with_noise(self.residual_noise(u))
+            return replace(self, noise=self.residual_noise(u))
         if self._rates is None:
             return self
-        return self.with_noise(replace(self.noise, gyro=self.residual_noise(u).gyro))
+        return replace(self, noise=replace(self.noise, gyro=self.residual_noise(u).gyro))
 
     def pieces(self, count: int) -> np.ndarray:
         """(K,) in which of so many pieces of its drive each residual is, errors of starts apart."""
@@ -215,8 +212,7 @@ class Objective:
         sizes = [table[0].size for table in tables]
         pose = residual[:, : sizes[0]].reshape(tables[0].shape)
         yaw = np.array([trial.start.yaw for trial in self.trials])[:, None]
-        x, y = pose[..., 0], pose[..., 1]
-        turned = [np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x, pose[..., 2]]
+        turned = [*turned_by(pose[..., 0], pose[..., 1], -yaw), pose[..., 2]]
         end = sum(sizes) + (0 if self._rates is None else self._rates[1].shape[1])
         return np.concatenate([*turned, residual[:, sizes[0] : end]], axis=1)
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.manoeuvre_library import OWN, REVERSING, make_command
-from sysid.logs.metrics import ideal_replay
+from sysid.logs.manoeuvre_library import FRACTIONS, OWN, REVERSING, make_command
+from sysid.logs.metrics import integrate
 from sysid.logs.records import Command, GyroStream, OdometryStream, PoseStream, Start, Trial
 from sysid.missing.drives import Drives
 from sysid.missing.joint_fit import Refit
@@ -38,7 +38,7 @@ LEAST, ENOUGH = 3.0, 5.0  # standard deviations by which a drive separates effec
 MOST_REPEATS = 9
 SIZES = (1.0, 0.5, 0.2)  # shares of the log's largest speed and yaw rate that every manoeuvre is tried at
 HEADINGS = (0.0, 90.0, 180.0, 270.0)  # start headings [degrees] that are tried where a rival is fixed in the room
-FRACTIONS = (1.0, 0.75, 0.5, 0.35, 0.2)  # of the time in motion, where the room is too small
+PATH = 200  # points of a path that commands ask for
 REFINED = 24  # drives for which the absorbed part is computed as well
 POLISH = 3  # iterations of the refit of a rival that the search has not refitted
 
@@ -152,10 +152,9 @@ def _space(trials: Sequence[Trial]) -> tuple[np.ndarray, np.ndarray]:
     """Corners (2,), (2,) of the space that trials took up [m]: by the outside pose, else by their commands."""
     paths = []
     for trial in trials:
-        truth = trial.ground_truth or ideal_replay(_as_trial(trial.command, trial.start, trial.duration, 200, 200)
-                                                   ).ground_truth
-        assert truth is not None
-        paths.append(np.column_stack([truth.x, truth.y]))
+        truth = trial.ground_truth
+        ideal = integrate(trial.command, trial.start, np.linspace(0.0, trial.duration, PATH))
+        paths.append(np.column_stack(ideal[:2] if truth is None else [truth.x, truth.y]))
     points = np.concatenate(paths)
     return points.min(0), points.max(0)
 
@@ -170,9 +169,7 @@ def _fitting(whole: PlannedDrive, low: np.ndarray, high: np.ndarray, longest: fl
         command = drive.command
         if command.t[-1] + drive.dt > longest + 1e-9:
             continue
-        ideal = ideal_replay(_as_trial(command, Start(yaw=heading), longest, 200, 200)).ground_truth
-        assert ideal is not None
-        path = np.column_stack([ideal.x, ideal.y])
+        path = np.column_stack(integrate(command, Start(yaw=heading), np.linspace(0.0, longest, PATH))[:2])
         if (np.ptp(path, axis=0) <= high - low + 1e-9).all():
             x, y = (low + high) / 2 - (path.min(0) + path.max(0)) / 2
             return replace(drive, start=(float(x), float(y), heading))
@@ -304,7 +301,6 @@ def write_next_command(out: Path, proposal: dict[str, Any] | None) -> Path | Non
     """Write the commands of a proposal into a run folder, in a dataset's format; None where there is no drive."""
     if proposal is None or proposal["file"] is None:
         return None
-    command = command_of(proposal)
     path = Path(out) / proposal["file"]
-    write_csv(path, COMMAND_HEADER, np.column_stack([command.t, command.v, command.omega]))
+    write_csv(path, COMMAND_HEADER, command_of(proposal).table)
     return path

@@ -178,9 +178,11 @@ def fit_unnamed(bench: UnnamedReplays) -> Unnamed:
         return TableFit(table, gains - price(table, split), smoothing, products, columns, phases)
 
     firsts, screened = [group[0] for group in groups], []
+    sizes = [len(group) for group in groups]
+    positions = [part.tolist() for part in np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])]
     for table in tables(result):
         chosen = firsts if table.quantity not in ROOM else sum(groups, [])
-        split = [[i] for i in range(len(firsts))] if chosen is firsts else _positions(groups)
+        split = [[i] for i in range(len(firsts))] if chosen is firsts else positions
         gain = float(table_fit(table, chosen, split).gains.sum())
         screened.append((gain * len(residual) / len(chosen), table))
     screened.sort(key=lambda one: -one[0])
@@ -218,12 +220,6 @@ def _range(series: np.ndarray) -> tuple[float, float]:
 def price(table: WrenchTable, groups: Sequence[Sequence[int]]) -> np.ndarray:
     """(G,) what the trials of each group gain by a start angle of their own even where there is nothing."""
     return np.array([ANGLE_PRICE * len(group) for group in groups]) * (table.quantity in WHEELS)
-
-
-def _positions(groups: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Positions of each group's trials in the groups one after the other."""
-    ends = np.cumsum([len(group) for group in groups])
-    return [list(range(end - len(group), end)) for end, group in zip(ends, groups, strict=True)]
 
 
 def _replayed(

@@ -119,7 +119,6 @@ class Kind:
 
 
 def errors_of(evidence: Information, confidence: float = CONFIDENCE) -> StandardErrors:
-    """The errors of estimates."""
     hessian, inverse = evidence.blocks.sum((0, 1)), evidence.inverse
     independent = np.sqrt(np.diag(inverse @ hessian @ inverse) * evidence.variance)
     kinds = _kinds(evidence, inverse)

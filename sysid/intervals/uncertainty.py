@@ -31,8 +31,6 @@ WIDEST = 3.0  # times a half-width at the fit that it may have at the end: an in
 
 @dataclass(frozen=True)
 class Estimate:
-    """One fitted parameter."""
-
     name: str
     initial: float
     value: float

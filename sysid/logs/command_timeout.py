@@ -35,8 +35,6 @@ class Stop:
 
 @dataclass(frozen=True)
 class Timeout:
-    """The time-out of a base."""
-
     value: float  # s after the last command
     low: float
     high: float  # 95 % interval [s]

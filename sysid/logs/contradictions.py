@@ -30,7 +30,7 @@ from sysid.logs.directions import (
     pooled,
 )
 from sysid.logs.planar import differenced, half_span
-from sysid.logs.records import OdometryStream, PoseStream, Trial, logged_pose
+from sysid.logs.records import Trial, logged_pose
 from sysid.logs.streams import SMOOTHING, speeds
 
 LITTLE = 0.75  # share of the motion that a direction must explain, below which something is wrong
@@ -323,21 +323,18 @@ def _jumps_of(name: str, trial: Trial) -> np.ndarray:
 
 def two_sources(name: str, trials: Sequence[Trial]) -> list[str]:
     """A sentence on a pose whose rows take turns between two."""
-    found = [(trial, apart) for trial in trials if (apart := _taking_turns(getattr(trial, name)))]
+    found = []
+    for trial in trials:
+        if (pose := logged_pose(getattr(trial, name), ROWS)) is not None:
+            place = pose.x + 1j * pose.y
+            next_one, over_two = (float(np.mean(np.square(np.abs(place[k:] - place[:-k])))) for k in (1, 2))
+            if over_two < TURNS * next_one:
+                found.append((trial, float(np.sqrt(next_one))))
     if not found:
         return []
     trial, apart = found[0]
     return [f"{name}: in {len(found)} of {len(trials)} trials ({trial.name}) its rows take turns between two poses "
             f"{apart:.2g} m apart, as where two nodes send on one topic. Record each on a topic of its own."]
-
-
-def _taking_turns(stream: OdometryStream | PoseStream | None) -> float:
-    """How far the two poses are apart [m] between which rows take turns; 0 where they do not."""
-    if (pose := logged_pose(stream, ROWS)) is None:
-        return 0.0
-    place = pose.x + 1j * pose.y
-    next_one, over_two = (float(np.mean(np.square(np.abs(place[k:] - place[:-k])))) for k in (1, 2))
-    return float(np.sqrt(next_one)) if over_two < TURNS * next_one else 0.0
 
 
 def frozen(name: str, trials: Sequence[Trial]) -> list[str]:

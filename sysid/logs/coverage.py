@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -84,22 +85,15 @@ def _peak_acceleration(trial: Trial) -> float:
     return float(np.percentile(rates[-1], 99)) if rates else float("nan")
 
 
-@dataclass(frozen=True)
-class ReplicateGroup:
-    """How well the drives of one manoeuvre repeat."""
-
-    trials: tuple[str, ...]
-    spread: dict[str, float]  # standard deviation between drives, in the frame of each start, like "ground_truth.x" [m]
-
-
-def replicate_spread(trials: tuple[Trial, ...]) -> list[ReplicateGroup]:
-    """Spread of each group of replicates."""
+def replicate_spread(trials: tuple[Trial, ...]) -> list[dict[str, Any]]:
+    """Of each group of replicates `trials`, and the `spread`: standard deviation between drives, in the frame of each
+    start, like "ground_truth.x" [m]."""
     groups = []
     for group in replicate_groups(trials):
         noise = replicate_noise(tuple(group)) or {}
         spread = {f"{channel}.{name}": float(value) for channel, values in noise.items()
                   for name, value in zip(SPREAD_NAMES[channel], values, strict=True) if np.isfinite(value)}
-        groups.append(ReplicateGroup(tuple(trial.name for trial in group), spread))
+        groups.append({"trials": [trial.name for trial in group], "spread": spread})
     return groups
 
 
@@ -311,7 +305,7 @@ def blind_spots(log: Log, excitations: dict[str, Excitation]) -> list[Blind]:
          "turn on the spot and drive circles to both sides"),
         (not any(abs(bound) > 0.05 for e in found for bound in e.v), "no straight motion",
          "rolling resistance, forward slip, wheel radius", "drive straight at two speeds"),
-        (_few(found, "v", 0.1), "one speed", "resistance that grows with speed, air drag; acceleration limit apart "
+        (_one_speed(found), "one speed", "resistance that grows with speed, air drag; acceleration limit apart "
          "from delay and lag", "drive the same manoeuvre at half and at full speed"),
         (max((e.step_sizes for e in found), default=0) < 3, "steps of hardly any different size",
          "delay, lag and acceleration limit apart from one another: only their scaling with the step separates them",
@@ -338,11 +332,10 @@ def blind_spots(log: Log, excitations: dict[str, Excitation]) -> list[Blind]:
     return [Blind(*words) for holds, *words in rules if holds]
 
 
-def _few(found: Sequence[Excitation], name: str, width: float) -> bool:
-    """Whether the trials' greatest speeds, where they move at all, differ by less than `width`."""
-    greatest = [max(abs(bound) for bound in getattr(e, name)) for e in found]
-    moving = [value for value in greatest if value > 0.05]
-    return bool(moving) and max(moving) - min(moving) < width and all(e.step_sizes < 3 for e in found)
+def _one_speed(found: Sequence[Excitation]) -> bool:
+    """Whether the trials' greatest speeds, where they move at all, differ by less than 0.1 m/s."""
+    moving = [greatest for e in found if (greatest := max(map(abs, e.v))) > 0.05]
+    return bool(moving) and max(moving) - min(moving) < 0.1 and all(e.step_sizes < 3 for e in found)
 
 
 def _one_heading(found: Sequence[Excitation]) -> bool:

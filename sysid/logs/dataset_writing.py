@@ -122,7 +122,6 @@ def _place(partial: Path, folder: Path, trials: Sequence[str]) -> None:
 
 
 def _contents(trial: Path) -> dict[str, bytes]:
-    """Content of each stream of a trial."""
     return {stream: path.read_bytes() for stream in HEADERS if (path := trial / f"{stream}.csv").exists()}
 
 

@@ -23,8 +23,6 @@ LEFT_OUT = 0.1  # share of what was measured that a short stream costs, above wh
 
 @dataclass(frozen=True)
 class ConvertConfig:
-    """Options of a conversion."""
-
     source: Path
     """ROS bag, CSV or TUM file, folder of one of them, LeRobotDataset, or a measured set."""
     out: Path = Path("runs/dataset")

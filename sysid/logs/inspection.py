@@ -47,8 +47,7 @@ def inspect(log: Log) -> dict[str, Any]:
                     "streams": {name: asdict(one) | {"rate": one.rate} for name, one in qualities[trial.name].items()},
                     "clock": {name: asdict(one) for name, one in clocks[trial.name].items()}}
                    for trial in log.trials],
-        "replicates": [{"trials": list(group.trials), "spread": group.spread}
-                       for group in replicate_spread(log.trials)],
+        "replicates": replicate_spread(log.trials),
         "blind_spots": [asdict(one) for one in blind_spots(log, excitations)],
     }
 

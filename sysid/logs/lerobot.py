@@ -201,7 +201,6 @@ def _file_episodes(
 
 
 def _task_names(pa: Any, path: Path) -> dict[int, str]:
-    """Task of each task_index."""
     if (file := path / "meta/tasks.parquet").exists():
         table = _read_table(pa, file)
         texts = next((table[name] for name in ("task", "__index_level_0__") if name in table), [])

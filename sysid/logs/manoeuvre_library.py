@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.logs.metrics import ideal_replay
+from sysid.logs.metrics import integrate
 from sysid.logs.planar import turned_by
 from sysid.logs.records import Command, OdometryStream, PoseStream, Start, Trial
 from whill_mjx.logs.manoeuvres import MANOEUVRES, STANDSTILL, Pieces, Scenario
@@ -143,9 +143,8 @@ def _longest(name: str, v: float, omega: float, limits: Limits) -> Command | Non
         command = make_command(name, v, omega, fraction * limits.seconds, limits.dt)
         if command.v.min() < limits.v_min - 1e-9:
             return None
-        ideal = ideal_replay(as_trial(Candidate(name, command))).ground_truth
-        assert ideal is not None
-        path = CLEARANCE * np.column_stack([ideal.x, ideal.y])
+        t = np.arange(0.0, command.t[-1] + 1e-9, SAMPLE_DT)
+        path = CLEARANCE * np.column_stack(integrate(command, Start(), t)[:2])
         if command.t[-1] <= limits.seconds + 2 * STANDSTILL + 1e-9 and placement(path, limits) is not None:
             return command
     return None

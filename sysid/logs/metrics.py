@@ -7,26 +7,10 @@ are scored apart: a vehicle whose wheels slip has two different motions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from sysid.logs.records import Command, OdometryStream, PoseStream, Prediction, Start, Trial, logged_pose, manoeuvre_of
 from sysid.logs.replicates import same_course, shifts
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Root mean square errors of one trial and channel; None where the channel was not measured."""
-
-    trajectory: float | None  # m, distance between positions
-    velocity: float | None  # m/s
-    angular_velocity: float | None  # rad/s
-    yaw: float | None  # rad
-
-    def as_dict(self) -> dict[str, float | None]:
-        return {metric: getattr(self, metric) for metric in METRICS}
-
 
 METRICS = ("trajectory", "velocity", "angular_velocity", "yaw")
 UNITS = {"trajectory": "m", "velocity": "m/s", "angular_velocity": "rad/s", "yaw": "rad"}
@@ -56,9 +40,9 @@ def errors_of(trial: Trial, prediction: Prediction) -> dict[str, dict[str, tuple
     return found
 
 
-def score(trial: Trial, prediction: Prediction) -> dict[str, Errors]:
-    """Errors per channel ("ground_truth", "odometry") of those that were measured."""
-    return {channel: Errors(**{metric: rmse(mine[metric][1]) if metric in mine else None for metric in METRICS})
+def score(trial: Trial, prediction: Prediction) -> dict[str, dict[str, float | None]]:
+    """channel ("ground_truth", "odometry") -> metric -> root mean square error; None where it was not measured."""
+    return {channel: {metric: rmse(mine[metric][1]) if metric in mine else None for metric in METRICS}
             for channel, mine in errors_of(trial, prediction).items()}
 
 

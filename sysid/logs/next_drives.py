@@ -37,8 +37,6 @@ OTHERS = ("random_steps", "figure_eight", "stop_and_go", "circle", "turn_ladder"
 
 @dataclass(frozen=True)
 class NextDrive:
-    """A drive to record next."""
-
     name: str
     why: str
     command: Command

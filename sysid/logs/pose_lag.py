@@ -26,8 +26,6 @@ Rates = Mapping[str, tuple[np.ndarray, np.ndarray]]  # trial -> times (T,) [s] a
 
 @dataclass(frozen=True)
 class PoseLag:
-    """A delay of the outside pose."""
-
     delay: float  # of all drives [s]
     low: float
     high: float  # 95 % interval of it, from blocks left out in turn [s]

@@ -111,7 +111,6 @@ def _first_rows(path: Path) -> list[list[str]]:
 
 
 def _numbers(row: list[str]) -> bool:
-    """Whether all fields are numbers."""
     try:
         return all(float(field) is not None for field in row)
     except ValueError:

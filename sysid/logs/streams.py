@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sysid.logs.planar import added_up, differenced, half_span
+from sysid.logs.planar import added_up, differenced, half_span, turned_by
 from sysid.logs.records import Command, OdometryStream, PoseStream, Trial, logged_pose
 
 GRID_DT = 0.02  # s, of the signals that are compared
@@ -236,7 +236,7 @@ def _pose_speeds(pose: PoseStream) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     grid = np.arange(pose.t[0] + half, pose.t[-1] - half, GRID_DT)
     dx, dy, turn = (differenced(pose.t, column, grid, half) for column in (pose.x, pose.y, pose.yaw))
     yaw = np.interp(grid, pose.t, pose.yaw)
-    return grid, np.cos(yaw) * dx + np.sin(yaw) * dy, turn
+    return grid, turned_by(dx, dy, -yaw)[0], turn
 
 
 def _correlations(values: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -79,7 +79,8 @@ def outside_hypotheses(spec: VehicleSpec, params: VehicleParams, fitted: Collect
     (`fitted`) is two-sided around the fitted value."""
     scale = Scale(spec, frozenset(describe(params)))
     found = [one for kind in in_order() if place_of(kind) == OUTSIDE for one in of_card(kind, scale)]
-    return tuple(_around_fit(one) if {axis.parameter for axis in one.axes} <= set(fitted) else one for one in found)
+    return tuple(replace(one, kind="parameter_shift", axes=tuple(replace(axis, signed=True) for axis in one.axes))
+                 if {axis.parameter for axis in one.axes} <= set(fitted) else one for one in found)
 
 
 def in_order() -> list[type[Effect]]:
@@ -107,11 +108,6 @@ def falsifiers() -> dict[str, tuple[Falsifier, ...]]:
 def _dotted(kind: type[Effect], parameter: str) -> str:
     """The full name of a parameter on an effect's card."""
     return parameter if "." in parameter else f"{kind.name}.{parameter}"
-
-
-def _around_fit(one: Hypothesis) -> Hypothesis:
-    """The hypothesis that a fitted value of the base model is wrong in either direction."""
-    return replace(one, kind="parameter_shift", axes=tuple(replace(axis, signed=True) for axis in one.axes))
 
 
 def with_catalogue(params: VehicleParams, found: tuple[Hypothesis, ...]) -> VehicleParams:

@@ -53,12 +53,10 @@ class Reference:
 
     @property
     def channels(self) -> int:
-        """Number of channels of motion."""
         return int(self.leftovers[0].series.shape[1])
 
     @property
     def gyro(self) -> bool:
-        """Whether a gyro is one of them."""
         return self.channels > len(CHANNELS)
 
     @property

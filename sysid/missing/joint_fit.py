@@ -13,8 +13,6 @@ from sysid.missing.catalogue import Hypothesis
 
 @dataclass(frozen=True)
 class Refit:
-    """A joint fit."""
-
     hypotheses: tuple[Hypothesis, ...]
     u: np.ndarray  # (P,) base parameters, unit coordinates
     q: np.ndarray  # (k,) coordinates of all hypotheses, one after the other
@@ -60,8 +58,6 @@ def moved_last(fit: Refit, number: int) -> Refit:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit begins."""
-
     hypotheses: tuple[Hypothesis, ...]
     u: np.ndarray  # (P,)
     q: np.ndarray  # (k,)
@@ -69,5 +65,4 @@ class Start:
 
     @classmethod
     def at(cls, refit: Refit) -> Start:
-        """Where a fit ended."""
         return cls(refit.hypotheses, refit.u, refit.q, refit.jacobian[..., : len(refit.u)])

@@ -12,6 +12,7 @@ from sysid.errors.space import Space
 from sysid.intervals.design import Criterion, Plan, Proposal
 from sysid.intervals.uncertainty import PRIOR_SD, UNIDENTIFIABLE
 from sysid.logs.manoeuvre_library import Limits
+from sysid.logs.planar import turned_by
 from sysid.pages.loop_words import MANOEUVRE_WORDS
 from whill_mjx.io.html import Cell, Section, charts, explained, html_page, paragraph, table
 from whill_mjx.io.svg import PALETTE, Axes, Line, line_chart
@@ -36,7 +37,8 @@ def text(found: Proposal, criterion: Criterion) -> str:
                  f"+-{after[index]:.1%}")
     lines.append(f"{'manoeuvre':18} {'sum of variances':>17} {'volume (log)':>13}   ({CRITERIA[criterion]} first)")
     lines += [f"{plan.candidate.name:18} {plan.trace:17.4f} {plan.volume:13.2f}" for plan in plans[:SHOWN]]
-    blind = blind_parameters(plans, space)
+    best = np.min([plan.deviation for plan in plans], axis=0)  # by any single candidate
+    blind = [name for name, one in zip(space.names, best, strict=True) if one > UNIDENTIFIABLE * PRIOR_SD]
     if blind:
         lines.append("no candidate determines: " + ", ".join(blind))
     return "\n".join(lines)
@@ -55,12 +57,6 @@ def in_words(name: str) -> str:
     whole = name.removesuffix("_50")
     said = MANOEUVRE_WORDS.get(whole, f"the {whole.replace('_', ' ')}") + (" at half size" if whole != name else "")
     return f"{said} ({name})"
-
-
-def blind_parameters(plans: Sequence[Plan], space: Space) -> list[str]:
-    """Parameters that no single candidate narrows well below their bounds."""
-    best = np.min([plan.deviation for plan in plans], axis=0)
-    return [name for name, deviation in zip(space.names, best, strict=True) if deviation > UNIDENTIFIABLE * PRIOR_SD]
 
 
 def write_page(path: Path, found: Proposal, limits: Limits, config: Any, about: dict[str, Parameter]) -> Path:
@@ -103,8 +99,8 @@ def write_page(path: Path, found: Proposal, limits: Limits, config: Any, about: 
 
 def _room_chart(plan: Plan, limits: Limits) -> str:
     x0, y0, yaw = plan.start
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    x, y = x0 + cos * plan.path[:, 0] - sin * plan.path[:, 1], y0 + sin * plan.path[:, 0] + cos * plan.path[:, 1]
+    along, across = turned_by(plan.path[:, 0], plan.path[:, 1], yaw)
+    x, y = x0 + along, y0 + across
     (length, width), margin = limits.room, limits.margin
     outer = Line(np.array([0, length, length, 0, 0.0]), np.array([0, 0, width, width, 0.0]), colour=PALETTE[6])
     inner = Line(np.array([margin, length - margin, length - margin, margin, margin]),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from sysid.logs.metrics import METRICS, UNITS
 from sysid.logs.records import CHANNEL_NAMES, CHECK
-from sysid.pages.before_after import drive_pictures, drive_table, shown_drive
+from sysid.pages.before_after import SMALLEST, drive_pictures, drive_table, shown_drive
 from sysid.pages.series import REPLAYED, Channel, TrialSeries
 from whill_mjx.io.html import (
     Cell,
@@ -35,7 +35,6 @@ MAX_TRIALS = 12  # drawn one by one
 MAX_ROWS = 60  # of a table of trials
 MAX_LAG = 3.0  # s of the autocorrelation
 WORSE = 1.001  # times as much counts as worse
-SMALLEST = 0.3  # m; a turn on the spot would fill its chart with noise
 
 
 def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[Section]:
@@ -45,8 +44,9 @@ def fit_sections(report: dict[str, Any], series: Sequence[TrialSeries]) -> list[
     if report.get("profiles"):
         sections.append(Section("Profile likelihoods", profiles(report)))
     if drawn:
-        sections += [Section("Trajectories", trajectories(drawn)), Section("Yaw", yaws(drawn)),
-                     Section("Residuals", residuals(series, drawn))]
+        note = "Measured and replayed paths; all replays start at the measured start pose. Held-out trials first."
+        sections += [Section("Trajectories", replayed_charts(drawn, path_chart, note)),
+                     Section("Yaw", replayed_charts(drawn, yaw_chart)), Section("Residuals", residuals(series, drawn))]
     return [*sections, Section("Errors per trial", errors(report)), Section("What got worse", worse(report)),
             Section("Search", search(report)), Section("Data and code", origin(report))]
 
@@ -260,18 +260,10 @@ def profiles(report: dict[str, Any]) -> str:
                          "value; autocorrelation is accounted for.") + table(header, rows)
 
 
-def trajectories(drawn: Sequence[TrialSeries]) -> str:
-    """Paths of the outside pose, or of the odometry without one."""
-    items = [path_chart(channel, trial.label) for trial in drawn
-             if (channel := _position_channel(trial)) is not None]
-    return replay_legend() + charts(items, "Measured and replayed paths; all replays start at the measured start "
-                                           "pose. Held-out trials first.")
-
-
-def yaws(drawn: Sequence[TrialSeries]) -> str:
-    """Yaw over time of the same trials."""
-    return replay_legend() + charts([yaw_chart(channel, trial.label) for trial in drawn
-                                     if (channel := _position_channel(trial)) is not None])
+def replayed_charts(drawn: Sequence[TrialSeries], chart: Callable[[Channel, str], str], note: str = "") -> str:
+    """A chart of the outside pose of each trial, or of its odometry without one."""
+    return replay_legend() + charts([chart(channel, trial.label) for trial in drawn
+                                     if (channel := _position_channel(trial)) is not None], note)
 
 
 def path_chart(channel: Channel, title: str, replays: Sequence[str] = REPLAYED) -> str:

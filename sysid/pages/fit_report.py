@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from sysid.errors.prior import moved
@@ -20,6 +19,7 @@ from sysid.logs.measured import load_any
 from sysid.logs.metrics import score
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.fit_statistics import statistics_of
+from sysid.pages.fit_page import choose
 from sysid.pages.plots import write_plots
 from sysid.pages.report import KIND, SCHEMA, code_hashes, error_rows, summaries, write_html, write_report
 from sysid.pages.series import collect, save
@@ -147,7 +147,7 @@ def fit_dataset(
         report["dataset"]["notes"].append(_twin_note(log, replays, fitted))
     write_report(out / "report.json", report)
     series = collect(trials, initial, fitted)
-    write_plots(out, series, rows)
+    write_plots(out, choose(series), rows)
     save(out, series)
     write_html(out, series)
     intervals = {one.name: (one.low, one.high) for one in fit.uncertainty.estimates if one.identifiable}
@@ -165,7 +165,7 @@ def _twin_replays(twin: Twin, trials: tuple[Trial, ...], physics_dt: float, fram
     plant = replace(vehicle_plant(twin.spec, VehicleConfig(physics_dt=physics_dt)), frame=frame)
     batch, _ = make_batch(trials, plant.dt)
     simulated = Replay(plant, batch, lambda _: twin.params).simulate(np.zeros((1, 1)))
-    return predictions(trials, jax.tree.map(lambda leaf: leaf[0], simulated))
+    return predictions(trials, simulated, 0)
 
 
 def _save_twin(out: Path, twin: Twin, fit: Fit, log: Log, replays: Sequence[Prediction], origin: dict[str, Any]
@@ -196,7 +196,7 @@ def _twin_note(log: Log, replays: Sequence[Prediction], fitted: Sequence[Predict
 def _distance(trial: Trial, replay: Prediction) -> float:
     """Position error against the outside pose, or else against the odometry [m]."""
     found = score(trial, replay)
-    return float(found["ground_truth" if trial.ground_truth is not None else "odometry"].trajectory or 0.0)
+    return float(found["ground_truth" if trial.ground_truth is not None else "odometry"]["trajectory"] or 0.0)
 
 
 SCALE = "odometry_scale.angular"

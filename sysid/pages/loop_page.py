@@ -223,21 +223,19 @@ def lives(report: dict[str, Any]) -> str:
 def wrench(one: dict[str, Any]) -> str:
     """The fitted tables, what they predict, and what else was tried."""
     text = describe_unnamed(one)
-    z, units = np.asarray(one["knots"]), one["units"]
+    z, units, brakes = np.asarray(one["knots"]), one["units"], one["kind"] == "brake"
     if one["periodic"]:
         z = np.append(z, 2 * np.pi)
     drawn = []
     for name, what in (("force", "force forward"), ("torque", "torque to the left")):
-        values = np.asarray(one["values"][name])
+        values, said = np.asarray(one["values"][name]), f"{what}{', times the direction of motion' * brakes}"
         if z.ndim == 2:  # a map: a line over x for every row
             lines = [Line(z[z[:, 1] == y, 0], values[z[:, 1] == y], f"y = {y:.2f} m", markers=True)
                      for y in np.unique(z[:, 1])]
-            drawn.append(line_chart(lines, "x in the room [m]", f"{name} [{units[name]}]",
-                                    f"{what}{', times the direction of motion' if one['kind'] == 'brake' else ''}"))
+            drawn.append(line_chart(lines, "x in the room [m]", f"{name} [{units[name]}]", said))
             continue
         line = Line(z, np.append(values, values[0]) if one["periodic"] else values, markers=True)
-        drawn.append(line_chart([line], f"{one['quantity']} [{units['quantity']}]", f"{name} [{units[name]}]",
-                                f"{what}{', times the direction of motion' if one['kind'] == 'brake' else ''}"))
+        drawn.append(line_chart([line], f"{one['quantity']} [{units['quantity']}]", f"{name} [{units[name]}]", said))
     gains = one["gain"]["by_manoeuvre"]
     drawn.append(bar_chart(list(gains), {"gain": list(gains.values())}, "squared residual less, held back",
                            log_y=False))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from sysid.follow_up.power import DRAWS, POWER, SEED, Days, false_alarms, power_curve, smallest
@@ -29,11 +28,8 @@ RESAMPLES = 2000
 
 
 def replay(result: Result, vehicle: Any, trials: tuple[Trial, ...]) -> list[Prediction]:
-    """Replays of trials by a vehicle."""
-
     drives, values = drives_of(result, trials, vehicle)
-    simulated = drives.replay(values[None])
-    return predictions(trials, jax.tree.map(lambda leaf: leaf[0], simulated))
+    return predictions(trials, drives.replay(values[None]), 0)
 
 
 def table(rows: list[dict[str, Any]], trials: tuple[Trial, ...], which: str) -> dict[str, Any]:

@@ -11,11 +11,9 @@ import numpy as np
 from sysid.pages.series import REPLAYED, Channel, TrialSeries
 from sysid.search.result import Trace
 from whill_mjx.io.folders import whole_file
-
-MAX_PANELS = 12
+from whill_mjx.io.svg import COLOURS
 
 SMALLEST_PANEL = 0.2  # m; a turn on the spot would fill the panel with its noise
-COLOURS = {"measured": "black", "ideal": "tab:gray", "initial": "tab:orange", "fitted": "tab:blue"}
 STYLES = {"measured": "-", "ideal": ":", "initial": "--", "fitted": "-"}
 
 
@@ -40,84 +38,57 @@ def save(figure: Any, path: Path, dpi: int) -> Path:
 
 
 def write_plots(folder: Path, series: Sequence[TrialSeries], rows: list[dict[str, Any]]) -> list[Path]:
-    """Write trajectories.png, yaw.png and errors.png; returns their paths. Held-out trials come first."""
-    chosen = choose(series)
-    columns = min(4, len(chosen))
-    lines = -(-len(chosen) // columns)
-    paths = []
-    for kind in ("trajectories", "yaw"):
-        figure, axes = pyplot().subplots(lines, columns, figsize=(3.6 * columns, 3.2 * lines), squeeze=False,
-                                         layout="constrained")
-        for axis in axes.flat[len(chosen) :]:
-            axis.set_visible(False)
-        for axis, trial in zip(axes.flat, chosen, strict=False):
-            channel = trial.channels.get("ground_truth") or trial.channels["odometry"]
-            _draw(axis, kind, channel, {name: name for name in REPLAYED})
-            _label(axis, kind, trial.label)
-            if kind == "trajectories":
-                reach = np.array([-0.5, 0.5]) * SMALLEST_PANEL
-                axis.plot(trial.start[0] + reach, trial.start[1] + reach, alpha=0.0)
-        axes.flat[0].legend(fontsize=7)
-        paths.append(save(figure, folder / f"{kind}.png", 110))
-    return [*paths, _error_bars(folder / "errors.png", rows, {trial.name for trial in chosen})]
+    """Write trajectories.png, yaw.png and errors.png of some trials; returns their paths."""
+    panels = [(trial.channels.get("ground_truth") or trial.channels["odometry"], trial.label) for trial in series]
+    names = {name: name for name in REPLAYED}
+    paths = [_write_panels(folder / f"{kind}.png", kind, panels, names, 110) for kind in ("trajectories", "yaw")]
+    return [*paths, _error_bars(folder / "errors.png", rows, {trial.name for trial in series})]
 
 
 def write_paper_figures(
     folder: Path, series: Sequence[TrialSeries], trajectories: Sequence[str], yaws: Sequence[str]
 ) -> list[Path]:
     """Write paper_trajectories.png and paper_yaw.png of such manoeuvres: one panel each, of its first drive."""
-    paths = []
+    paths, names = [], {"measured": "measured", "initial": "initial", "fitted": "optimised"}
     for kind, manoeuvres in (("trajectories", trajectories), ("yaw", yaws)):
-        figure, axes = pyplot().subplots(1, len(manoeuvres), figsize=(3.6 * len(manoeuvres), 3.0), squeeze=False,
-                                         layout="constrained")
-        for axis, manoeuvre in zip(axes.flat, manoeuvres, strict=True):
-            trial = next((one for one in series if one.name.startswith(f"{manoeuvre}_")), None)
-            if trial is None:
-                axis.set_visible(False)
-                continue
-            channel = trial.channels.get("odometry") or trial.channels["ground_truth"]
-            _draw(axis, kind, channel, {"measured": "measured", "initial": "initial", "fitted": "optimised"})
-            _label(axis, kind, manoeuvre.replace("_", " ") + (" (held out)" if trial.held_out else ""))
-        axes.flat[0].legend(fontsize=7)
-        paths.append(save(figure, folder / f"paper_{kind}.png", 150))
+        firsts = [(name, next((one for one in series if one.name.startswith(f"{name}_")), None)) for name in manoeuvres]
+        panels = [(trial.channels.get("odometry") or trial.channels["ground_truth"],
+                   name.replace("_", " ") + (" (held out)" if trial.held_out else ""))
+                  for name, trial in firsts if trial is not None]
+        paths.append(_write_panels(folder / f"paper_{kind}.png", kind, panels, names, 150))
     return paths
 
 
-def _draw(axis: Any, kind: str, channel: Channel, names: Mapping[str, str]) -> None:
-    """Draw what was measured and replayed into a panel of trajectories or of yaw; `names`: what each is called."""
-    for name, label in names.items():
-        table = channel.values[name]
-        across, up = (table[:, 0], table[:, 1]) if kind == "trajectories" else (channel.t, table[:, 2])
-        if np.isfinite(up).any():
-            axis.plot(across, up, STYLES[name], color=COLOURS[name], label=label,
-                      linewidth=2.2 if name == "measured" else 1.3, marker="." if len(channel.t) < 60 else None,
-                      markersize=3)
-
-
-def _label(axis: Any, kind: str, title: str) -> None:
-    """Title and axes of a panel of trajectories, of which both have one scale, or of yaw."""
-    axis.set_title(title, fontsize=9)
-    axis.set_xlabel("x [m]" if kind == "trajectories" else "t [s]", fontsize=8)
-    axis.set_ylabel("y [m]" if kind == "trajectories" else "yaw [rad]", fontsize=8)
-    axis.tick_params(labelsize=7)
-    axis.grid(alpha=0.3)
-    if kind == "trajectories":
-        axis.axis("equal")
-
-
-def choose(series: Sequence[TrialSeries]) -> list[TrialSeries]:
-    """At most MAX_PANELS trials: held-out ones first, spread evenly, at least a third of the panels for training."""
-    held_out = [trial for trial in series if trial.held_out]
-    training = [trial for trial in series if not trial.held_out]
-    room = max(MAX_PANELS - len(training), 2 * MAX_PANELS // 3)
-    first = _spread(held_out, room)
-    return first + _spread(training, MAX_PANELS - len(first))
-
-
-def _spread(items: list[TrialSeries], count: int) -> list[TrialSeries]:
-    if len(items) <= count:
-        return items
-    return [items[i] for i in np.linspace(0, len(items) - 1, count).round().astype(int)]
+def _write_panels(
+    path: Path, kind: str, panels: Sequence[tuple[Channel, str]], names: Mapping[str, str], dpi: int
+) -> Path:
+    """Write a panel of trajectories, whose axes have one scale, or of yaw for each channel, with its title. `names`:
+    what is drawn, and what it is called."""
+    columns = min(4, max(len(panels), 1))
+    lines = max(-(-len(panels) // columns), 1)
+    figure, axes = pyplot().subplots(lines, columns, figsize=(3.6 * columns, 3.2 * lines), squeeze=False,
+                                     layout="constrained")
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis, (channel, title) in zip(axes.flat, panels, strict=False):
+        for name, label in names.items():
+            table = channel.values[name]
+            across, up = (table[:, 0], table[:, 1]) if kind == "trajectories" else (channel.t, table[:, 2])
+            if np.isfinite(up).any():
+                axis.plot(across, up, STYLES[name], color=COLOURS[name], label=label,
+                          linewidth=2.2 if name == "measured" else 1.3, marker="." if len(channel.t) < 60 else None,
+                          markersize=3)
+        axis.set_title(title, fontsize=9)
+        axis.set_xlabel("x [m]" if kind == "trajectories" else "t [s]", fontsize=8)
+        axis.set_ylabel("y [m]" if kind == "trajectories" else "yaw [rad]", fontsize=8)
+        axis.tick_params(labelsize=7)
+        axis.grid(alpha=0.3)
+        if kind == "trajectories":
+            axis.axis("equal")
+            reach, start = np.array([-0.5, 0.5]) * SMALLEST_PANEL, channel.values["fitted"][0, :2]
+            axis.plot(start[0] + reach, start[1] + reach, alpha=0.0)
+    axes.flat[0].legend(fontsize=7)
+    return save(figure, path, dpi)
 
 
 def _error_bars(path: Path, rows: list[dict[str, Any]], names: set[str]) -> Path:

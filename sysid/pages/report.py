@@ -8,14 +8,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sysid.logs.measured import load_any
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.logs.records import Prediction, Trial
-from sysid.pages.fit_page import fit_sections, headline
+from sysid.pages.fit_page import REPLAYS, fit_sections, headline
 from sysid.pages.series import FILE, TrialSeries, collect, load
 from sysid.replay.rollout import Replay, make_batch, predictions, vehicle_plant
 from whill_mjx.io.fields import Field, check_table, shown
@@ -37,7 +35,6 @@ REPORT = tuple(
     ) for name in names
 )  # fmt: skip
 """Entries that every report has, as they are read."""
-REPLAYS = ("ideal", "initial", "fitted")
 
 
 def error_rows(trials: tuple[Trial, ...], initial: list[Prediction], fitted: list[Prediction]) -> list[dict[str, Any]]:
@@ -46,7 +43,7 @@ def error_rows(trials: tuple[Trial, ...], initial: list[Prediction], fitted: lis
     for trial, before, after in zip(trials, initial, fitted, strict=True):
         scores = [score(trial, prediction) for prediction in (ideal_replay(trial), before, after)]
         for channel in scores[0]:
-            tables = [one[channel].as_dict() for one in scores]
+            tables = [one[channel] for one in scores]
             metrics = {metric: dict(zip(REPLAYS, (table[metric] for table in tables), strict=True))
                        for metric in METRICS if tables[0][metric] is not None}
             rows.append({"trial": trial.name, "manoeuvre": trial.manoeuvre, "group": trial.group,
@@ -136,9 +133,7 @@ def replay(run: Path, report: dict[str, Any]) -> list[TrialSeries]:
     batch, _ = make_batch(trials, plant.dt)
     replayed = Replay(plant, batch, lambda values: set_values(params, names, values)).simulate(
         np.array([[one[key] for one in report["parameters"]] for key in ("initial", "value")], float))
-    before, after = (predictions(trials, jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf)[k], replayed))
-                     for k in (0, 1))
-    return collect(trials, before, after)
+    return collect(trials, predictions(trials, replayed, 0), predictions(trials, replayed, 1))
 
 
 def code_hashes() -> dict[str, str]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid.pages.plots import pyplot, save
 from sysid.replay.robot import Robot
+from sysid.replay.robot_contacts import ROUND, corners
 
 DRIVEN, FLOOR, REST = "#d95f02", "#1b9e77", "#bbbbbb"
 AROUND = 32  # points of a rim
@@ -32,48 +33,27 @@ def write_robot(path: Path, robot: Robot, loads: dict[str, float]) -> None:
     for side, name in ((robot.sides == 0, "L"), (robot.sides == 1, "R")):
         for joint in np.array(joints)[side]:
             axes[0].annotate(name, data.xanchor[joint][:2], ha="center", va="center")
-    middle = data.qpos[robot.root : robot.root + 3] + _turned(data, robot.root, robot.point)
-    ahead = _turned(data, robot.root, robot.forward) * robot.track
+    middle = data.qpos[robot.root : robot.root + 3] + data.xmat[robot.base].reshape(3, 3) @ robot.point
+    ahead = robot.axes[0] * robot.track
     axes[0].annotate("", middle[:2] + ahead[:2], middle[:2], arrowprops={"arrowstyle": "->", "lw": 1.5})
     axes[0].plot(*middle[:2], "k+")
     axes[0].set(title="from above (arrow: forward)", xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes[1].set(title="from the side", xlabel="x [m]", ylabel="z [m]", aspect="equal")
-    axes[1].axhline(float(data.geom_xpos[_floor(host), 2]), color="k", lw=0.8)
+    floor = int(np.flatnonzero(host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))[0])
+    axes[1].axhline(float(data.geom_xpos[floor, 2]), color="k", lw=0.8)
     figure.suptitle(f"{robot.path.name}: driven wheels orange, other supports green")
     save(figure, path, 110)
 
 
-def _floor(host: mujoco.MjModel) -> int:
-    return int(np.flatnonzero(host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))[0])
-
-
-def _turned(data: mujoco.MjData, root: int, vector: np.ndarray) -> np.ndarray:
-    found = np.zeros(3)
-    mujoco.mju_rotVecQuat(found, vector, data.qpos[root + 3 : root + 7])
-    return found
-
-
 def _outline(host: mujoco.MjModel, geom: int) -> np.ndarray:
     """Points (N, 3) on a geom, in its frame."""
-    kind, size = int(host.geom_type[geom]), host.geom_size[geom]
-    angle = np.linspace(0, 2 * np.pi, AROUND)
-    if kind == int(mujoco.mjtGeom.mjGEOM_MESH):
-        mesh = int(host.geom_dataid[geom])
-        first = int(host.mesh_vertadr[mesh])
-        return np.asarray(host.mesh_vert[first : first + int(host.mesh_vertnum[mesh])])
-    if kind == int(mujoco.mjtGeom.mjGEOM_BOX):
-        return np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T * size
-    if kind == int(mujoco.mjtGeom.mjGEOM_CYLINDER):
-        ring = np.stack([size[0] * np.cos(angle), size[0] * np.sin(angle)], axis=-1)
-        return np.concatenate([np.column_stack([ring, np.full(AROUND, z)]) for z in (-size[1], size[1])])
-    rim = np.linspace(0, np.pi, AROUND // 2)
-    ball = np.array([[np.sin(b) * np.cos(a), np.sin(b) * np.sin(a), np.cos(b)] for a in angle for b in rim])
-    if kind == int(mujoco.mjtGeom.mjGEOM_ELLIPSOID):
-        return ball * size
-    ball = ball * size[0]
-    if kind == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
-        return np.concatenate([ball + [0, 0, z] for z in (-size[1], size[1])])
-    return ball
+    kind, radius = int(host.geom_type[geom]), host.geom_size[geom, 0]
+    if kind not in map(int, ROUND):
+        return corners(host, geom)
+    angle, tilt = (one.ravel() for one in np.meshgrid(np.linspace(0, 2 * np.pi, AROUND), np.linspace(0, np.pi, AROUND)))
+    tilt = np.full_like(tilt, np.pi / 2) if kind == int(mujoco.mjtGeom.mjGEOM_CYLINDER) else tilt
+    around = radius * np.column_stack([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), np.cos(tilt)])
+    return np.concatenate([around + middle for middle in np.unique(corners(host, geom), axis=0)])
 
 
 def _hull(points: np.ndarray) -> np.ndarray:

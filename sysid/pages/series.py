@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.metrics import CHANNELS, ideal_replay
+from sysid.logs.planar import turned_by
 from sysid.logs.records import Prediction, Trial
 from whill_mjx.io.folders import whole_file
 from whill_mjx.io.reading import read_arrays
@@ -27,8 +28,6 @@ AGAIN = "Fit again; without the file, the trials are replayed."
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel of one trial."""
-
     t: np.ndarray  # (T,) s
     values: dict[str, np.ndarray]  # "measured" and the names of replays -> (T, 3) or (T, 5)
 
@@ -36,17 +35,13 @@ class Channel:
         """Replayed minus measured (T, C); position along and left of the measured heading, yaw as an angle."""
         measured = self.values["measured"]
         error = self.values[replay] - measured
-        cos, sin = np.cos(measured[:, 2]), np.sin(measured[:, 2])
-        x, y = error[:, 0].copy(), error[:, 1].copy()
-        error[:, 0], error[:, 1] = cos * x + sin * y, -sin * x + cos * y
+        error[:, 0], error[:, 1] = turned_by(error[:, 0], error[:, 1], -measured[:, 2])
         error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
         return error
 
 
 @dataclass(frozen=True)
 class TrialSeries:
-    """All channels of one trial."""
-
     name: str
     held_out: bool
     start: tuple[float, float, float]  # x, y [m], yaw [rad] in the room

@@ -67,7 +67,7 @@ class CourseReplay:
         ends = {"index": sent(every), "weight": sent(last)}
         read: dict[str, Any] = {f"{name}_{what}": one for name in self._times for what, one in ends.items()}
         whole = replace(batch, command=sent(command[first]), start=sent(from_start), **read)
-        kind = HostReplay if plant.host is not None and on_processor() else Replay
+        kind: Any = HostReplay if plant.host is not None and on_processor() else Replay
         self._replay = kind(plant, whole, set_values)
         self.paths = paths or PathReplay(plant, set_values, rows_of_call(self.courses))
         self._traced, self.drives, self.states = self._replay, self.courses, self.courses * records
@@ -91,16 +91,16 @@ class CourseReplay:
     def simulate(self, values: np.ndarray) -> Simulated:
         """Replay of all trials with each of values (N, P); leaves gain the axis N in front."""
         if isinstance(self._replay, HostReplay):
-            return self._spread(self._replay.simulate(values), motion=True)
+            return self._spread(self._replay.simulate(values))
         if not on_processor():
             size = max(len(values), 2 * values.shape[1] + 1)  # a single one and a Jacobian's are compiled together
-            return self._spread(self._replay.simulate(values, size), motion=True)
+            return self._spread(self._replay.simulate(values, size))
         sets, courses = len(values), self.courses
         paths = self.paths(np.repeat(values, courses, axis=0), self._replay.batch, np.tile(np.arange(courses), sets))
         paths = paths.reshape(sets, courses, *paths.shape[1:])
         turned = paths[..., TURN] if self._replay.batch.gyro_index is not None else None
         path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)  # type: ignore[arg-type]
-        return self._spread(path, motion=True)
+        return self._spread(path)
 
     def compile(self, parameters: int, trials: tuple[Trial, ...]) -> None:
         """Begin to compile what a processor needs to replay drives as long as these trials by so many parameters."""
@@ -109,41 +109,26 @@ class CourseReplay:
 
     def traced(self, values: jax.Array) -> Simulated:
         """As `simulate`, within a compiled function."""
-        return self._spread(self._traced.traced(values), motion=True)
+        return self._spread(self._traced.traced(values))
 
-    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
-        """Replay and derivatives (a last axis P) for each of values (N, P)."""
-        rows = 1 if on_processor() else len(values)
-        parts = []
-        for i in range(0, len(values), rows):
-            at, slope = self._replay.jacobian(values[i : i + rows])
-            parts.append((self._spread(at, motion=True), self._spread(slope, motion=False)))
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-
-    def _spread(self, simulated: Simulated, motion: bool) -> Simulated:
-        """Courses (N, U, R + 1, ...) at the trials' times (N, B, M, ...); derivatives are turned but not moved."""
+    def _spread(self, simulated: Simulated) -> Simulated:
+        """Courses (N, U, R + 1, ...) at the trials' times (N, B, M, ...)."""
         xp = namespace(simulated.pose)
         pose, odometry, *gyro = (self._at(name, xp.asarray(getattr(simulated, name))) for name in self._times)
         diverged: Any = simulated.diverged[:, self._course]
-        extra = (1,) * (pose.ndim - 4)
-        turn = (self._to[:, 2] - self._from[:, 2]).reshape(-1, 1, *extra)  # (B, 1)
-        x, y, yaw = (pose[:, :, :, c] for c in range(3))
-        if motion:
-            x, y, yaw = x - self._from[:, :1], y - self._from[:, 1:2], yaw + turn
+        turn = self._to[:, 2:] - self._from[:, 2:]  # (B, 1)
+        x, y, yaw = pose[..., 0] - self._from[:, :1], pose[..., 1] - self._from[:, 1:2], pose[..., 2] + turn
         cos, sin = np.cos(turn), np.sin(turn)
-        x, y = cos * x - sin * y, sin * x + cos * y
-        if motion:
-            x, y = x + self._to[:, :1], y + self._to[:, 1:2]
-        moved: Any = xp.stack([x, y, yaw], axis=3)
-        return Simulated(moved, odometry, diverged, *gyro)
+        placed: Any = xp.stack([cos * x - sin * y + self._to[:, :1], sin * x + cos * y + self._to[:, 1:2], yaw], axis=3)
+        return Simulated(placed, odometry, diverged, *gyro)
 
     def _at(self, name: str, values: Any) -> Any:
-        """Values (N, U, R + 1, C, ...) of courses at the trials' times (N, B, M, C, ...)."""
+        """Values (N, U, R + 1, C) of courses at the trials' times (N, B, M, C)."""
         xp, (index, weight) = namespace(values), self._times[name]
-        flat = values.reshape(len(values), -1, *values.shape[3:])
+        flat = values.reshape(len(values), -1, values.shape[3])
         rows = self._course[:, None] * values.shape[2] + index
         before, after = (xp.take(flat, one, axis=1) for one in (rows, rows + 1))  # ten times as fast as by two indices
-        return before + weight.reshape(*weight.shape, *(1,) * (values.ndim - 3)) * (after - before)
+        return before + weight[..., None] * (after - before)
 
 
 def rows_of_call(courses: int) -> int:
@@ -192,7 +177,6 @@ class DifferenceReplay:
         self.replay.compile(self.space.size, trials)
 
     def simulate(self, values: np.ndarray) -> Simulated:
-        """As that of the replay."""
         return self.replay.simulate(values)
 
     def traced(self, values: jax.Array) -> Simulated:

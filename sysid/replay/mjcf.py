@@ -34,9 +34,18 @@ from sysid.replay.records import Plant
 from sysid.replay.robot import Robot
 from sysid.replay.robot_drive import RobotDrive, rolling_ratio
 from sysid.replay.robot_loading import load_robot
-from sysid.replay.robot_parameters import Entry, default_paths, drive_entries, resolve, turning_inertia, write_mjcf
+from sysid.replay.robot_parameters import (
+    SIZES,
+    Entry,
+    Size,
+    default_paths,
+    drive_entries,
+    resolve,
+    sizes_of,
+    turning_inertia,
+    write_mjcf,
+)
 from sysid.replay.robot_rest import FALLS
-from sysid.replay.robot_sizes import SIZES, Size, sizes_of
 from sysid.replay.robot_vehicle import skid_vehicle, vehicle_of
 from whill_mjx.processor import shares_results
 from whill_mjx.vehicle.model import import_mjx
@@ -182,7 +191,6 @@ class Stepped:
         self.wheels = np.array(robot.wheels)
 
     def plant(self) -> Plant:
-        """The functions."""
         return Plant(self.place, self.substep, self.observe, float(self.robot.host.opt.timestep), self.move)
 
     def place(self, params: Parameters, start: jax.Array) -> Motion:

@@ -62,8 +62,8 @@ class HostReplay:
         self.batch, self._host = batch, host
         self._before, self._after = of_all(before), of_all(after)
 
-    def simulate(self, values: np.ndarray, size: int | None = None) -> Simulated:
-        """Replay with each of values (N, P); leaves gain the axis N in front. `size` is not needed."""
+    def simulate(self, values: np.ndarray) -> Simulated:
+        """Replay with each of values (N, P); leaves gain the axis N in front."""
         given = _in_blocks(lambda sets: self._before(sets, self.batch), np.asarray(values, float))
         keys = [tuple(leaf[i].tobytes() for leaf in jax.tree.leaves(given)) for i in range(len(values))]
         first = {key: i for i, key in reversed(list(enumerate(keys)))}
@@ -79,14 +79,6 @@ class HostReplay:
         found: Simulated = _in_blocks(lambda sets, seen: self._after(sets, self.batch, seen),
                                       np.asarray(values, float), motion)
         return found
-
-    def jacobian(self, values: np.ndarray) -> tuple[Simulated, Simulated]:
-        """There is none: differences of `simulate` are taken."""
-        raise NotImplementedError("a model that the host steps has no tangents; take differences")
-
-    def traced(self, values: jax.Array) -> Simulated:
-        """There is none: an accelerator steps the model by itself."""
-        raise NotImplementedError("a model that the host steps cannot be traced")
 
 
 def _in_blocks(function: Callable[..., Any], *arrays: np.ndarray) -> Any:

@@ -87,14 +87,14 @@ def _outline(host: mujoco.MjModel, data: mujoco.MjData, joint: int, geoms: Seque
     """Points (K, 2) of geoms: where they are along a joint's axle, from its anchor, and how far they reach from it."""
     found, axis = [np.zeros((0, 2))], data.xaxis[joint]
     for geom in geoms:
-        away = data.geom_xpos[geom] + _corners(host, geom) @ data.geom_xmat[geom].reshape(3, 3).T - data.xanchor[joint]
+        away = data.geom_xpos[geom] + corners(host, geom) @ data.geom_xmat[geom].reshape(3, 3).T - data.xanchor[joint]
         along = away @ axis
         margin = float(host.geom_size[geom, 0]) if int(host.geom_type[geom]) in map(int, ROUND) else 0.0
         found.append(np.column_stack([along, np.linalg.norm(away - np.outer(along, axis), axis=1) + margin]))
     return np.concatenate(found)
 
 
-def _corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
+def corners(host: mujoco.MjModel, geom: int) -> np.ndarray:
     """Points (K, 3) of a geom in its frame: a mesh's vertices, a box's corners, a ball's middle, an ellipsoid's
     surface."""
     kind, mesh = int(host.geom_type[geom]), int(host.geom_dataid[geom])

@@ -14,8 +14,7 @@ from mujoco import rollout
 from sysid.replay.arrays import moved, rotated
 from sysid.replay.cores import cores
 from sysid.replay.robot import Robot
-from sysid.replay.robot_parameters import Entry, Overlaid
-from sysid.replay.robot_sizes import Size
+from sysid.replay.robot_parameters import Entry, Overlaid, Size
 
 SPIN = 5.0  # rad/s of a wheel in the drives that are tried
 SECONDS = 3.0  # of each; the first second is left out

@@ -45,8 +45,6 @@ mujoco.set_mju_user_warning(lambda text: None)
 
 @dataclass(frozen=True)
 class RobotFile:
-    """What was read."""
-
     spec: Any  # the editable mujoco.MjSpec
     notes: list[str]  # on what was replaced or left out
     friction: dict[str, float] | None = None

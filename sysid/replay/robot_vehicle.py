@@ -20,10 +20,9 @@ import numpy as np
 
 from sysid.replay.models import Parameters, Twin, describe_parameters, with_effects
 from sysid.replay.robot import Robot
-from sysid.replay.robot_contacts import tyre_places
-from sysid.replay.robot_parameters import Entry, Overlaid
+from sysid.replay.robot_contacts import parts, tyre_places
+from sysid.replay.robot_parameters import Entry, Overlaid, Size
 from sysid.replay.robot_servos import ROTOR_SHARE
-from sysid.replay.robot_sizes import Size
 from whill_mjx.vehicle.parameters import set_values
 from whill_mjx.vehicle.presets import in_short, preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -66,7 +65,8 @@ def vehicle_of(
                    wheelbase=abs(support), rear_axle_x=min(support, 0.0) - float(low[0] + high[0]) / 2,
                    wheel_inertia=robot.spin, body_length=length, body_width=width, body_height=height)
     (tyre, wheels), (ball, balls) = (
-        _friction(robot, entries, values, geoms) for geoms in (_tyres(robot), robot.sliding))
+        _friction(robot, entries, values, geoms) for geoms in (
+            tuple(parts(robot.host, robot.host.jnt_bodyid[robot.joints[0]]).tolist()), robot.sliding))
     host, motor = robot.host, robot.actuators[0]
     gain = float(abs(host.actuator_gear[motor, 0] * host.actuator_gainprm[motor, 0])) if robot.motors else 1.0
     found = {
@@ -151,11 +151,6 @@ def extent_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     middle = (middle - tyre_places(host, data, robot.joints).mean(0)) @ axes.T
     reach = np.einsum("gij,gj->gi", np.abs(axes @ turns), host.geom_aabb[geoms, 3:])
     return (middle - reach).min(0), (middle + reach).max(0)
-
-
-def _tyres(robot: Robot) -> tuple[int, ...]:
-    body = robot.host.jnt_bodyid[robot.joints[0]]
-    return tuple(int(one) for one in np.flatnonzero(robot.host.body_weldid[robot.host.geom_bodyid] == body))
 
 
 def _friction(

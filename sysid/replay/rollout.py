@@ -18,8 +18,7 @@ import numpy as np
 
 from sysid.logs.records import GyroStream, OdometryStream, PoseStream, Prediction, Trial
 from sysid.replay.arrays import quaternion_product
-from sysid.replay.compiled import Compiled
-from sysid.replay.cores import on_all_cores, on_processor
+from sysid.replay.cores import Compiled, on_all_cores, on_processor
 from sysid.replay.delays import delay_apart
 from sysid.replay.one_drive import (
     IN_ONE,
@@ -91,7 +90,8 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     stride = max(round(record_dt / dt), 1)
     record = stride * dt
     records = max(math.ceil(trial.duration / record - 1e-6) for trial in trials) + 1
-    command = np.stack([_held_commands(trial, records * stride, dt) for trial in trials])
+    middles = (np.arange(records * stride) + 0.5) * dt  # of the physics steps, in which what is in force then acts
+    command = np.stack([trial.commanded(middles).T for trial in trials])
     start = np.array([[t.start.x, t.start.y, t.start.yaw, t.start.v, t.start.omega] for t in trials])
     pose_t, pose, pose_mask = padded([trial.ground_truth for trial in trials], 3)
     odometry_t, odometry, odometry_mask = padded([trial.odometry for trial in trials], 5)
@@ -181,8 +181,9 @@ class Replay:
         return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], output)
 
 
-def predictions(trials: tuple[Trial, ...], simulated: Simulated) -> list[Prediction]:
-    """Per trial what `metrics.score` compares, from the padded arrays of one parameter set (no axis N)."""
+def predictions(trials: tuple[Trial, ...], simulated: Simulated, row: int | None = None) -> list[Prediction]:
+    """Per trial what `metrics.score` compares, from the padded arrays of a set: that of a row of the axis N, if any."""
+    simulated = simulated if row is None else jax.tree.map(lambda leaf: leaf[row], simulated)
     results = []
     for i, trial in enumerate(trials):
         truth = odometry = None
@@ -303,11 +304,6 @@ class PathReplay:
         return np.concatenate(parts)[:count]
 
 
-def _held_commands(trial: Trial, steps: int, dt: float) -> np.ndarray:
-    """(S, 2) command in force in the middle of each physics step; before the first command the start's speeds hold."""
-    return trial.commanded((np.arange(steps) + 0.5) * dt).T
-
-
 def _grid(t: np.ndarray, record: float, records: int) -> tuple[np.ndarray, np.ndarray]:
     index = np.clip(np.floor(t / record + 1e-9).astype(int), 0, records - 1)
     return index, np.clip(t / record - index, 0.0, 1.0)
@@ -317,7 +313,7 @@ def padded(
     streams: Sequence[PoseStream | OdometryStream | GyroStream | None], columns: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times (B, M), values (B, M, C) and mask (B, M, C) of streams of different length; nan values are masked."""
-    tables = [_table(stream, columns) for stream in streams]
+    tables = [(np.zeros(0), np.zeros((0, columns))) if one is None else (one.t, one.values) for one in streams]
     longest = max(max(len(t) for t, _ in tables), 1)
     width = tables[0][1].shape[1]
     time = np.zeros((len(tables), longest))
@@ -328,7 +324,3 @@ def padded(
         values[i, : len(t)] = np.where(known, table, 0.0)
         mask[i, : len(t)] = known
     return time, values, mask
-
-
-def _table(stream: PoseStream | OdometryStream | GyroStream | None, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    return (np.zeros(0), np.zeros((0, columns))) if stream is None else (stream.t, stream.values)

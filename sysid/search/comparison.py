@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from sysid.errors.pose_objective import Objective, Replays
@@ -38,7 +37,6 @@ class Recorder:
         self.best: list[tuple[int, float, float, np.ndarray]] = []
 
     def simulate(self, values: np.ndarray) -> Simulated:
-        """As that of the replay."""
         found = self._replay.simulate(values)
         self._record(values, found, len(values))
         return found
@@ -119,9 +117,9 @@ class Judge:
         simulated = self._replay.simulate(self._space.to_values(different))
         errors = []
         for k in range(len(different)):
-            one = predictions(self._trials, jax.tree.map(lambda leaf, k=k: leaf[k], simulated))
+            one = predictions(self._trials, simulated, k)
             channels = [score(trial, prediction) for trial, prediction in zip(self._trials, one, strict=True)]
-            tables = [(found.get("ground_truth") or found["odometry"]).as_dict() for found in channels]
+            tables = [found.get("ground_truth") or found["odometry"] for found in channels]
             known = [row["trajectory"] for row in tables if row["trajectory"] is not None]
             errors.append(np.mean(known) if known else np.nan)
         return np.array(errors)[back.reshape(-1)]

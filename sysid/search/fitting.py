@@ -178,8 +178,6 @@ def choose(
 
 @dataclass(frozen=True)
 class Problem:
-    """What a search is given."""
-
     plant: Plant
     params: Any  # where it starts
     space: Space
@@ -329,8 +327,7 @@ def predict(fit: Fit, trials: tuple[Trial, ...]) -> tuple[list[Prediction], list
     values = np.stack([np.asarray(models.get_parameters(one, fit.space.names))
                        for one in (fit.initial_params, fit.params)])
     simulated = replay.simulate(values)
-    initial, fitted = (predictions(trials, jax.tree.map(lambda leaf, i=i: leaf[i], simulated)) for i in (0, 1))
-    return initial, fitted
+    return predictions(trials, simulated, 0), predictions(trials, simulated, 1)
 
 
 def _has(trial: Trial, channels: str) -> bool:

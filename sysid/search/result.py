@@ -18,7 +18,6 @@ class Stages:
         self._progress, self._count, self._number = progress, count, 0
 
     def begin(self, name: str) -> Progress | None:
-        """Begin the next stage; its progress."""
         self._number += 1
         progress, title = self._progress, f"stage {self._number} of {self._count}, {name}"
         if progress is None:

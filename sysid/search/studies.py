@@ -290,7 +290,6 @@ class _Flock:
         return True
 
     def release(self) -> None:
-        """Let it go."""
         os.close(self._file)
 
 

@@ -288,7 +288,7 @@ def test_report_and_vehicle_file(sloping, report, tmp_path):
 def test_before_is_the_vehicle_as_it_was_and_no_parameter_of_it_moved(sloping, report):
     trials = (*sloping.log.training, *sloping.log.held_out)
     as_it_was = replay(sloping, sloping.reference.params, trials)
-    errors = [score(trial, one)["ground_truth"].trajectory for trial, one in zip(trials, as_it_was, strict=True)
+    errors = [score(trial, one)["ground_truth"]["trajectory"] for trial, one in zip(trials, as_it_was, strict=True)
               if trial.held_out]
     assert report["before"]["held_out"]["ground_truth"]["trajectory"] == pytest.approx(np.mean(errors))
 
@@ -405,7 +405,7 @@ def test_refit_to_poses_lowers_the_training_error(drives, sloping):
 
     def error(vehicle):
         pairs = zip(few.trials, replay(plain, vehicle, few.trials), strict=True)
-        return np.mean([score(trial, prediction)["ground_truth"].trajectory for trial, prediction in pairs])
+        return np.mean([score(trial, prediction)["ground_truth"]["trajectory"] for trial, prediction in pairs])
 
     before = vehicle_before(plain)
     unknown = replace(plain, prepared=replace(plain.prepared, reference=replace(plain.reference, known=False)))

@@ -17,8 +17,8 @@ from rosbags.rosbag2.reader import zstd
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import sysid.convert as convert_module
+from sysid.logs.bags.messages import CHAIR_DEFINITION, JOYSTICK_FIELDS
 from sysid.logs.bags.recording import CHAIR_STATE
-from sysid.logs.bags.wheel_states import CHAIR_DEFINITION, JOYSTICK_FIELDS
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log, make_trial
 from sysid.logs.measured import load_any, load_whole

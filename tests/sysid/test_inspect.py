@@ -371,9 +371,9 @@ def test_replicate_spread_is_the_deviation_between_drives():
     first, second = trial_of(command, "drive_1"), trial_of(command, "drive_2")
     second = replace(second, odometry=replace(second.odometry, v=second.odometry.v + 0.02))
     (group,) = replicate_spread((first, second))
-    assert group.trials == ("drive_1", "drive_2")
-    assert group.spread["odometry.v"] == pytest.approx(0.02 / np.sqrt(2), rel=1e-6)
-    assert group.spread["ground_truth.x"] == pytest.approx(0.0, abs=1e-9)
+    assert group["trials"] == ["drive_1", "drive_2"]
+    assert group["spread"]["odometry.v"] == pytest.approx(0.02 / np.sqrt(2), rel=1e-6)
+    assert group["spread"]["ground_truth.x"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_command_writes_page_text_json_and_picture(tmp_path, capsys):

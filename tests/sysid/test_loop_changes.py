@@ -28,7 +28,7 @@ def test_squares_are_those_of_the_score():
     one, replay = trial("circle"), off(0.1, 0)
     squares, scores = squared_errors(one, replay), score(one, replay)
     for channel, errors in scores.items():
-        for metric, value in errors.as_dict().items():
+        for metric, value in errors.items():
             assert value is None or np.sqrt(squares[channel][metric][1].mean()) == pytest.approx(value)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -104,11 +103,8 @@ def test_few_starts_that_go_on_do_not_wait_for_many(poses, monkeypatch):
     monkeypatch.setattr(normal_equations, "FEW", 2)
     equations = NormalEquations(dataclasses.replace(poses, replay=dataclasses.replace(poses.replay)), at_once=21)
     used = []
-    for (name, size), function in equations._compiled.items():
-        compiled = function.result()
-        done = Future()
-        done.set_result(lambda *given, size=size, compiled=compiled: (used.append(size), compiled(*given))[1])
-        equations._compiled[name, size] = done
+    compiled = equations.sums["quadratic"]
+    monkeypatch.setitem(equations.sums, "quadratic", lambda u, *more: (used.append(len(u)), compiled(u, *more))[1])
     many = equations.quadratic(SETS)
     few = equations.quadratic(SETS[:2])
     assert used == [21, 2]
@@ -121,7 +117,7 @@ def test_long_drives_are_replayed_fewer_at_a_time(poses, monkeypatch):
     courses = poses.replay.replay
     for states, expected in ((10 * courses.states, 10), (1, 1), (10**9, normal_equations.DRIVES // courses.drives)):
         monkeypatch.setattr(normal_equations, "STATES", states)
-        monkeypatch.setattr(normal_equations.Sums, "compile", lambda *_: None)
+        monkeypatch.setattr(normal_equations.Compiled, "compile", lambda *_: None)
         assert make_equations(poses).sizes["cost"] == (expected,)
 
 
@@ -131,10 +127,11 @@ def test_other_noise_is_weighed_without_compiling_again(poses):
     louder = dataclasses.replace(first, whitener=first.whitener.scaled(2.0))
     one, other = NormalEquations(first, at_once=3), NormalEquations(louder, at_once=3)
     np.testing.assert_allclose(one.costs(SETS), 4 * other.costs(SETS), rtol=1e-4)
-    assert one.sums is other.sums and len(one.sums.compiled) == 2  # costs and quadratics, of one size each
+    assert one.sums is other.sums
+    assert [len(each._programs) for each in one.sums.values()] == [1, 1]  # costs and quadratics, of one size each
     longer = dataclasses.replace(first, whitener=fit_whitener(first.target, first.mask))
     NormalEquations(longer, at_once=3).costs(SETS)
-    assert len(one.sums.compiled) == 2
+    assert [len(each._programs) for each in one.sums.values()] == [1, 1]
     wide = dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.1)))
     narrow = dataclasses.replace(poses, prior=Prior(np.full(3, 0.5), np.full(3, 0.001)))
     assert (NormalEquations(narrow, 3).costs(SETS) > NormalEquations(wide, 3).costs(SETS)).all()

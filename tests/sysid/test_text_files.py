@@ -12,7 +12,7 @@ import pytest
 
 import sysid
 from bridge.whill import ChairState, WheelOdometry
-from sysid.logs.bags.wheel_states import chair_odometry, chair_row, joint_row, joint_twist
+from sysid.logs.bags.messages import chair_odometry, chair_row, joint_row, joint_twist
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log
 from sysid.logs.planar import integrate_speeds

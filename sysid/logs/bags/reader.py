@@ -19,17 +19,21 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.bags import transforms
-from sysid.logs.bags.messages import frames_of, header_time, read_message, sideways_speed, without_stamp
-from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS, OPTIONS, PACKED, SUFFIXES, Bag, BagStream, short_type
-from sysid.logs.bags.topics import choose_topics, framed, namespaces, no_pose, not_read
-from sysid.logs.bags.wheel_states import (
+from sysid.logs.bags.messages import (
     CHAIR_DEFINITION,
     COARSE,
     JOYSTICK_FIELDS,
     chair_odometry,
+    frames_of,
+    header_time,
     joint_twist,
+    read_message,
+    sideways_speed,
     usable_joints,
+    without_stamp,
 )
+from sysid.logs.bags.recording import CHAIR_STATE, COLUMNS, OPTIONS, PACKED, SUFFIXES, Bag, BagStream, short_type
+from sysid.logs.bags.topics import choose_topics, framed, namespaces, no_pose, not_read
 from sysid.logs.planar import integrate_speeds
 from whill_mjx.io.fields import shown
 from whill_mjx.io.reading import LONGEST_REASON

@@ -36,8 +36,6 @@ PACKED = (".zst", ".zstd")
 
 @dataclass(frozen=True)
 class BagStream:
-    """One topic of a bag."""
-
     topic: str
     kind: str  # message type, like "nav_msgs/msg/Odometry"
     received: np.ndarray  # (T,) s, Unix time at which the recorder got the message

@@ -54,7 +54,6 @@ class Links:
             self.rows.setdefault(key, []).append((received, stamp, *row))
 
     def frames(self) -> list[str]:
-        """Names of all frames."""
         return list(dict.fromkeys(frame for key in self.rows for frame in key))
 
     def __str__(self) -> str:
@@ -253,7 +252,6 @@ def _only_pose(trees: Sequence[Links], wanted: Sequence[str], notes: list[str]) 
 
 
 def _arrow(link: tuple[str, str]) -> str:
-    """A link, as messages name it."""
     return f"{shown(link[0])} to {shown(link[1])}"
 
 

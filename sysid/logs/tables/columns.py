@@ -40,8 +40,6 @@ SAID = "as said"  # why a column has its role where somebody gave no unit
 
 @dataclass(frozen=True)
 class Column:
-    """What one column holds."""
-
     role: str
     file: str  # stem of the file
     name: str

@@ -62,15 +62,12 @@ def _joined(
     found = {"t": t}
     for _, one in parts:
         at = np.searchsorted(one["t"], t, side="right") - 1
-        found |= {key: values[at] if held else np.interp(t, one["t"], _going_on(key, values))
-                  for key, values in one.items() if key != "t"}
+        for key, values in one.items():
+            if key != "t":  # headings have no wraps already
+                smooth = without_wraps(values) if key.endswith("_angle") else values
+                found[key] = values[at] if held else np.interp(t, one["t"], smooth)
     what = "hold until the next row of their file" if held else f"are interpolated to the times of {main}"
     return found, [f"{stream}: {', '.join(sorted(set(one) - {'t'}))} of {file} {what}" for file, one in others]
-
-
-def _going_on(quantity: str, values: np.ndarray) -> np.ndarray:
-    """Values (T,) that may be interpolated: angles of wheels without wraps, as headings are already."""
-    return without_wraps(values) if quantity.endswith("_angle") else values
 
 
 def _rows_of_file(
