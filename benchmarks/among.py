@@ -88,6 +88,8 @@ class Options:
     """Other settings of PPO."""
     safety: str = "monitor"
     """As of the training command; "none" where nothing scans."""
+    sights: tuple[str, ...] = SIGHTS
+    """What the policies are shown while they are judged: of open, blank, freeze and lost. What was judged stays."""
     seed: Annotated[int, SEED] = JUDGED
     """Of the worlds of the test."""
     results: Path = RESULTS
@@ -170,8 +172,8 @@ def judged_driver(preset: Preset, course: Course, params: Any) -> tuple[Driver, 
     return Driver("policy", lambda state, key: memory, act, preset.task.action_repeat, weights=weights), memory
 
 
-def judge(options: Options, preset: Preset, params: Any) -> dict[str, Any]:
-    """Shares of the endings in the unseen maps, with each sight, all maps together and each alone."""
+def judge(options: Options, preset: Preset, params: Any, sights: list[str]) -> dict[str, Any]:
+    """Shares of the endings in the unseen maps, with each of some sights, all maps together and each alone."""
     task = dataclasses.replace(preset.task, **read_fields(preset.task, (f"map={maps_of(options, options.unseen)}",)))
     batch = make_evaluation_env(task, VEHICLE, 1)
     course = Course(batch.env, batch.params, batch=options.episodes)
@@ -179,8 +181,8 @@ def judge(options: Options, preset: Preset, params: Any) -> dict[str, Any]:
     driver, memory = judged_driver(preset, course, params)
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(keys), *jnp.shape(leaf))), memory)
     found: dict[str, Any] = {}
-    for number, sight in enumerate(SIGHTS):
-        episodes = course.drive(driver, keys, memory=(*memory[:3], jnp.full(len(keys), number)))
+    for sight in sights:
+        episodes = course.drive(driver, keys, memory=(*memory[:3], jnp.full(len(keys), SIGHTS.index(sight))))
         people = episodes.scene.people
         assert people is not None
         bumped = np.asarray(people.held & people.there).sum(-1)
@@ -210,7 +212,7 @@ def held_run(options: Options, senses: str, seed: int) -> Iterator[Path]:
     """Hold the folder of a run until the block ends; FolderRefused where it was trained or judged by other options."""
     folder = options.out / f"{senses}_{seed}"
     asked = dataclasses.asdict(options)
-    identity = {name: asked[name] for name in asked if name not in ("runs", "out", "results")}
+    identity = {name: asked[name] for name in asked if name not in ("runs", "out", "results", "sights")}
     with claim_folder(folder, KIND, OUTPUTS) as claim:
         claim.settle(identity, (folder / "training.json").exists())
         yield folder
@@ -225,8 +227,10 @@ def one_run(options: Options, senses: str, seed: int) -> dict[str, Any]:
 def made_run(options: Options, senses: str, seed: int, folder: Path) -> dict[str, Any]:
     """Result of a run whose folder this process holds: what it lacks is made."""
     path = folder / "result.json"
-    if path.exists():
-        return dict(json.loads(path.read_text()))
+    known = dict(json.loads(path.read_text())) if path.exists() else {}
+    lacking = [sight for sight in options.sights if sight not in known.get("sights", {})]
+    if not lacking:
+        return known
     _, preset = preset_of(options, senses, seed, folder)
     save_vehicle(folder / "vehicle.toml", *load_vehicle(VEHICLE)[:2])
     took_path = folder / "training.json"
@@ -237,8 +241,9 @@ def made_run(options: Options, senses: str, seed: int, folder: Path) -> dict[str
     env = make_evaluation_env(preset.task, VEHICLE, 1).env
     params = weights_of(preset, env, folder / "weights.msgpack")
     began = time.monotonic()
-    result = {"senses": senses, "seed": seed, **took, **provenance(), "episodes": options.episodes,
-              "sights": judge(options, preset, params), "judging_s": time.monotonic() - began}  # fmt: skip
+    judged = {**known.get("sights", {}), **judge(options, preset, params, lacking)}
+    result = {"senses": senses, "seed": seed, **took, **provenance(), "episodes": options.episodes, "sights": judged,
+              "safety": plain(preset.safety), "judging_s": time.monotonic() - began}  # fmt: skip
     write_json(path, result)
     return result
 
@@ -275,8 +280,10 @@ def figures_of(results: list[dict[str, Any]]) -> dict[str, Any]:
         sights = [one["sights"] for one in mine]
         columns = {name: [one["open"][name] for one in sights]
                    for name in ("arrived", "collided", "timeout", "bumped")}  # fmt: skip
-        columns["blinded"] = [max(one[kind]["arrived"] for kind in ("blank", "freeze")) for one in sights]
-        columns["goal_alone"] = [one["lost"]["arrived"] for one in sights]
+        if all({"blank", "freeze"} <= set(one) for one in sights):
+            columns["blinded"] = [max(one[kind]["arrived"] for kind in ("blank", "freeze")) for one in sights]
+        if all("lost" in one for one in sights):
+            columns["goal_alone"] = [one["lost"]["arrived"] for one in sights]
         columns["decisions"] = [float(one["decisions"]) for one in mine]
         columns["training_s"] = [one["training_s"] for one in mine]
         stamp = {key: mine[-1][key] for key in ("command", "release", "versions", "commit", "date")}
@@ -291,6 +298,8 @@ def figures_of(results: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main(options: Options) -> None:
     """Make all runs, record the figures after each, and write the policy files."""
+    if not options.sights or options.sights[0] != "open" or not set(options.sights) <= set(SIGHTS):
+        raise OptionError(f"--sights {' '.join(options.sights)}: give open first, then some of {', '.join(SIGHTS)}.")
     runs = []
     for text in options.runs:
         senses, _, seed = text.partition(":")
@@ -307,8 +316,8 @@ def main(options: Options) -> None:
         figures = figures_of(results)
         path = record("environment", CLAIM, figures, options.results)
         for name in ("arrived", "collided", "bumped", "timeout", "blinded", "goal_alone"):
-            one = figures[f"among_{senses}_{name}"]
-            print(f"among_{senses}_{name}: {one['value']:.4f} {one['repeats']} -> {path}", flush=True)
+            if one := figures.get(f"among_{senses}_{name}"):
+                print(f"among_{senses}_{name}: {one['value']:.4f} {one['repeats']} -> {path}", flush=True)
     for senses, number in runs:
         write_policy(options, senses, number)
 

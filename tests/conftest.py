@@ -30,7 +30,10 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"
 MOST_BYTES = 2_000_000_000
 """Memory of a worker beyond which it forgets what it has compiled."""
 
-QUICK_TO_COMPILE = ("dreamer", "whill_mjx", "test_among.py", "test_calibration.py")
+QUICK_TO_COMPILE = (
+    "dreamer", "whill_mjx", "test_among.py", "test_calibration.py", "test_effect_from_outside.py", "test_fit.py",
+    "test_loop_vehicle_file.py", "test_normal_equations.py", "test_pieces.py", "test_rollout.py", "test_search.py",
+)  # fmt: skip
 """Folders and files whose programs take far longer to compile than to run; most of `sysid` replay many long drives."""
 
 

@@ -36,7 +36,7 @@ class Safety:
     monitor_time: float = 0.0
     """Time until the vehicle would touch what its scanners see on its way: it slows down to leave so much [s]; 0 does
     not."""
-    monitor_margin: float = 0.2
+    monitor_margin: float = 0.1
     """Distance at which it no longer nears that [m]."""
 
     def __post_init__(self) -> None:
