@@ -52,6 +52,30 @@ def test_a_run_of_other_options_is_refused_before_any_training(tmp_path, monkeyp
         pass  # where figures go and which runs are made changes no result
 
 
-def test_a_run_is_named_by_senses_and_seed(tmp_path):
+@pytest.mark.quick
+def test_a_sight_that_lacks_is_judged_and_the_others_stay_as_they_were(tmp_path, monkeypatch):
+    options = among.Options(runs=("lidar:0",), out=tmp_path, results=tmp_path / "results", **TINY)
+    ends = dict(arrived=0.25, collided=0.5, timeout=0.25, bumped=0.0)
+    took = {"decisions": 8, "training_s": 1.0, "updates": 1, "device": "cpu"}
+    judged = {"blank": ends, "freeze": ends, "lost": ends}
+    with among.held_run(options, "lidar", 0) as folder:
+        (folder / "training.json").write_text(json.dumps(took))
+        (folder / "result.json").write_text(json.dumps({"sights": judged}))
+    monkeypatch.setattr(among, "weights_of", lambda *given: None)
+    monkeypatch.setattr(among, "write_policy", lambda *given: None)
+    monkeypatch.setattr(among, "judge", lambda options, preset, params, sights: {
+        **{sight: {**ends, "arrived": 1.0} for sight in sights}, "maps": {"made:7": ends}})
+    among.main(dataclasses.replace(options, sights=("open",)))
+    found = json.loads((folder / "result.json").read_text())["sights"]
+    assert {sight: found[sight]["arrived"] for sight in among.SIGHTS} == {
+        "open": 1.0, "blank": 0.25, "freeze": 0.25, "lost": 0.25}
+    figures = json.loads((tmp_path / "results" / "environment.json").read_text())["figures"]
+    assert figures["among_lidar_arrived"]["value"] == 1.0 and figures["among_lidar_blinded"]["value"] == 0.25
+
+
+def test_a_run_is_named_by_senses_and_seed_and_sights_by_their_names(tmp_path):
     with pytest.raises(OptionError, match="--runs radar:0"):
         among.main(among.Options(runs=("radar:0",), out=tmp_path))
+    for sights in ((), ("blank",), ("open", "dark")):
+        with pytest.raises(OptionError, match="give open first, then some of open, blank, freeze, lost"):
+            among.main(among.Options(runs=("lidar:0",), sights=sights, out=tmp_path))
