@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env
-from whill_mjx.learning.monitor import SLOWED, Monitor, monitor_of
+from whill_mjx.learning.monitor import PLACE, SLOWED, Monitor, monitor_of
 from whill_mjx.learning.shaping import find_safety, limited_policy, limiter_of
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.sensors.odometry import Odometry
@@ -107,10 +107,14 @@ def test_things_that_stand_do_not_come_while_the_vehicle_drives_and_turns():
     rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     things = np.array([[1.6, -1.2], *([x, 1.5] for x in np.arange(-3.0, 3.0, 0.05))])
     after = (things - axle - moved) @ rotation.T + axle
-    seen = {"lidar": scan(after, 0.1), "odometry": jnp.array([0.0, 0.0, 0.0, *twist])}
-    memory = {"lidar": scan(things, 0.1), SLOWED: jnp.zeros(1)}
+    heading = 0.7
+    cos, sin = np.cos(heading), np.sin(heading)
+    place = np.array([3.0 + moved[0] * cos - moved[1] * sin, -1.0 + moved[0] * sin + moved[1] * cos, heading + turn])
+    seen = {"lidar": scan(after, 0.1), "odometry": jnp.array([*place, 0.0, 0.0])}  # its speeds come late
+    memory = {"lidar": scan(things, 0.1), SLOWED: jnp.zeros(1), PLACE: jnp.array([3.0, -1.0, heading])}
     _, memory = monitor.slowed(jnp.array([0.3, 0.0]), STANDS, seen, memory)
     assert float(memory[SLOWED][0]) == 0.0
+    np.testing.assert_allclose(memory[PLACE], place, atol=1e-6)
 
 
 def test_something_that_a_ray_loses_or_that_was_hidden_stops_nobody():

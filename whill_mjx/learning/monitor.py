@@ -27,6 +27,8 @@ SLOWEST, FASTEST = 0.3, 2.0
 """Speeds with which things come [m/s]: less is the noise of two scans, and more a thing that was hidden before."""
 SLOWED = "slowed"
 """Name of the share of the commands (1,) that things which come have taken away."""
+PLACE = "place"
+"""Name of the vehicle's pose (3,) in its odometry at the scan before."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,12 @@ class Monitor:
     seconds: float
     """From one scan to the next."""
     odometry: str | None
-    """Name of the observation that tells the vehicle's speeds; None takes the last command for them."""
+    """Name of the observation that tells where the vehicle is; None takes what the last command would have moved it."""
 
     def memory(self) -> dict[str, jax.Array]:
         """What is remembered at the start of an episode, all zeros: no scan of any scanner, and not slowed."""
-        return {**{name: jnp.zeros(one.rays) for name, one in self.scanners}, SLOWED: jnp.zeros(1)}
+        scans = {name: jnp.zeros(one.rays) for name, one in self.scanners}
+        return {**scans, SLOWED: jnp.zeros(1), **({PLACE: jnp.zeros(3)} if self.odometry else {})}
 
     def slowed(self, command: jax.Array, last: jax.Array, seen: Mapping[str, jax.Array],
                memory: Mapping[str, jax.Array]) -> tuple[jax.Array, dict[str, jax.Array]]:  # fmt: skip
@@ -69,7 +72,7 @@ class Monitor:
             seen: observations by name; of each scanner the distances (rays,) [m].
             memory: after the scan before; zeros where there was none.
         """
-        moved = last if self.odometry is None else seen[self.odometry][3:5]
+        moved = self._moved(last, seen, memory)
         found = [self._points(one, seen[name], memory[name], moved) for name, one in self.scanners]
         points, comes = (jnp.concatenate(parts) for parts in zip(*found, strict=True))
         slowed = jnp.maximum(1.0 - self._time_left(points, comes), memory[SLOWED][0] - self.seconds / self.time)
@@ -78,9 +81,18 @@ class Monitor:
         allowed = jax.vmap(lambda way: way * self._share(way, points, comes))(ways)
         lost = jnp.sum(((allowed - eased) * jnp.array([1.0, self.half_length])) ** 2, -1)
         after = {**{name: seen[name] for name, _ in self.scanners}, SLOWED: slowed[None]}
+        if self.odometry:
+            after[PLACE] = seen[self.odometry][:3]
         other = jnp.where(lost[1] <= lost[2], allowed[1], allowed[2])
         least = jnp.where(lost[0] <= jnp.min(lost[1:]), allowed[0], other)
         return least, after
+
+    def _moved(self, last: jax.Array, seen: Mapping[str, jax.Array], memory: Mapping[str, jax.Array]) -> jax.Array:
+        """(3,) m, m, rad: how the axle has moved since the scan before, in the frame that it had then."""
+        if self.odometry is None:
+            return jnp.concatenate([_chord(last, self.seconds), last[1:] * self.seconds])
+        way = seen[self.odometry][:3] - memory[PLACE]
+        return jnp.concatenate([_turned(way[None, :2], -memory[PLACE][2])[0], way[2:]])
 
     def _apart(self, points: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Points (N, 2) m of the border nearest to others (N, 2), and the ways (N, 2) m from there to these."""
@@ -117,7 +129,7 @@ class Monitor:
         ways = np.stack([np.cos(angles), np.sin(angles)], -1)
         points = jnp.asarray(mount) + distances[:, None] * ways
         axle = jnp.array([self.turns_at, 0.0])
-        then = axle + _turned(points - axle, moved[1] * self.seconds) + _chord(moved, self.seconds) - mount
+        then = axle + _turned(points - axle, moved[2]) + moved[:2] - mount
         far = jnp.sqrt(jnp.sum(then**2, -1))
         near = then @ ways.T >= far[:, None] * np.cos((NEIGHBOURS + 0.5) * scanner.fov / scanner.rays)
         free = jnp.min(jnp.where(near, before, scanner.reach), -1)
