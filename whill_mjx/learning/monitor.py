@@ -16,6 +16,7 @@ import numpy as np
 from whill_mjx.env import Env
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.sensors.odometry import Odometry
+from whill_mjx.tasks.terms import to_body
 
 POSES = 8
 """Poses of the way ahead that are tested."""
@@ -91,8 +92,8 @@ class Monitor:
         """(3,) m, m, rad: how the axle has moved since the scan before, in the frame that it had then."""
         if self.odometry is None:
             return jnp.concatenate([_chord(last, self.seconds), last[1:] * self.seconds])
-        way = seen[self.odometry][:3] - memory[PLACE]
-        return jnp.concatenate([_turned(way[None, :2], -memory[PLACE][2])[0], way[2:]])
+        was, now = memory[PLACE], seen[self.odometry][:3]
+        return jnp.concatenate([to_body(was, now[:2]), now[2:] - was[2:]])
 
     def _apart(self, points: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Points (N, 2) m of the border nearest to others (N, 2), and the ways (N, 2) m from there to these."""
@@ -143,7 +144,8 @@ class Monitor:
         axle = jnp.array([self.turns_at, 0.0])
         met = []
         for time in np.arange(1, POSES + 1) * (2.0 * self.time / POSES):
-            there = axle + _turned(points + time * comes - axle - _chord(command, time), -command[1] * time)
+            pose = jnp.concatenate([axle + _chord(command, time), command[1:] * time])
+            there = axle + to_body(pose, (points + time * comes).T).T
             met.append((jnp.abs(there) < half + SIDE).all(-1))
         return jnp.stack(met).any(0)
 
