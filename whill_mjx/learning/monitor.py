@@ -95,27 +95,27 @@ class Monitor:
         was, now = memory[PLACE], seen[self.odometry][:3]
         return jnp.concatenate([to_body(was, now[:2]), now[2:] - was[2:]])
 
-    def _apart(self, points: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Points (N, 2) m of the border nearest to others (N, 2), and the ways (N, 2) m from there to these."""
+    def _apart(self, points: jax.Array, comes: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Of points (N, 2) [m] with velocities (N, 2) [m/s]: the border's nearest points (N, 2) m, the ways from there
+        (N, 2) m, their lengths (N,) m, and the speeds (N,) m/s with which the points come."""
         half = jnp.array([self.half_length, self.half_width])
         border = jnp.clip(points, -half, half)
-        return border, points - border
+        away = points - border
+        apart = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
+        return border, away, apart, -jnp.sum(comes * away, -1) / apart
 
     def _time_left(self, points: jax.Array, comes: jax.Array) -> jax.Array:
         """() share of the `time` until something comes within the margin; 1 where it takes longer, or nothing comes."""
-        _, away = self._apart(points)
-        apart = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
-        toward = -jnp.sum(comes * away, -1) / apart
+        _, _, apart, toward = self._apart(points, comes)
         left = (apart - self.margin) / (self.time * jnp.maximum(toward, 1e-6))
         return jnp.clip(jnp.min(jnp.where(toward > SLOWEST, left, 1.0)), 0.0, 1.0)
 
     def _share(self, command: jax.Array, points: jax.Array, comes: jax.Array) -> jax.Array:
         """() of a command (2,) that is left before points (N, 2) [m] with velocities (N, 2) [m/s]."""
-        border, away = self._apart(points)
-        apart = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
+        border, away, apart, toward = self._apart(points, comes)
         arm = border - jnp.array([self.turns_at, 0.0])
         speed = jnp.stack([command[0] - command[1] * arm[:, 1], command[1] * arm[:, 0]], -1)
-        nears, toward = jnp.sum(speed * away, -1) / apart, -jnp.sum(comes * away, -1) / apart
+        nears = jnp.sum(speed * away, -1) / apart
         allowed = jnp.maximum((apart - self.margin) / self.time - jnp.maximum(toward, 0.0), 0.0)
         slower = self._on_the_way(command, points, comes) & (nears > allowed)
         return jnp.min(jnp.where(slower, allowed / jnp.maximum(nears, 1e-6), 1.0))
