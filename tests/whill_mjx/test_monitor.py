@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env
-from whill_mjx.learning.monitor import PLACE, SLOWED, Monitor, monitor_of
+from whill_mjx.learning.monitor import PLACE, SCAN, SLOWED, Monitor, monitor_of
 from whill_mjx.learning.shaping import find_safety, limited_policy, limiter_of
 from whill_mjx.sensors.lidar import Lidar
 from whill_mjx.sensors.odometry import Odometry
@@ -40,7 +40,7 @@ def wall(ahead: float) -> jax.Array:
 def given(command, now, before=None, last=STANDS, slowed=0.0):
     """What is left of a command (2,), and the memory after it; without a scan before, nothing moves."""
     before = jnp.zeros(SCANNER.rays) if before is None else before
-    memory = {"lidar": before, SLOWED: jnp.array([slowed])}
+    memory = {SCAN + "lidar": before, SLOWED: jnp.array([slowed])}
     return MONITOR.slowed(jnp.array(command), jnp.asarray(last), {"lidar": now}, memory)
 
 
@@ -111,7 +111,7 @@ def test_things_that_stand_do_not_come_while_the_vehicle_drives_and_turns():
     cos, sin = np.cos(heading), np.sin(heading)
     place = np.array([3.0 + moved[0] * cos - moved[1] * sin, -1.0 + moved[0] * sin + moved[1] * cos, heading + turn])
     seen = {"lidar": scan(after, 0.1), "odometry": jnp.array([*place, 0.0, 0.0])}  # its speeds come late
-    memory = {"lidar": scan(things, 0.1), SLOWED: jnp.zeros(1), PLACE: jnp.array([3.0, -1.0, heading])}
+    memory = {SCAN + "lidar": scan(things, 0.1), SLOWED: jnp.zeros(1), PLACE: jnp.array([3.0, -1.0, heading])}
     _, memory = monitor.slowed(jnp.array([0.3, 0.0]), STANDS, seen, memory)
     assert float(memory[SLOWED][0]) == 0.0
     np.testing.assert_allclose(memory[PLACE], place, atol=1e-6)
@@ -148,4 +148,14 @@ def test_a_policy_with_the_monitor_gives_what_the_training_drove():
         np.testing.assert_allclose(action, other, atol=1e-6)
         command = low + (other + 1.0) * span
         np.testing.assert_allclose(carry["command"], command, atol=1e-6)
-    assert bool((carry["before_scan"] == seen["scan"]).all())
+    assert bool((carry["before_scan_scan"] == seen["scan"]).all())
+
+
+def test_scanners_may_have_the_names_of_what_the_monitor_remembers():
+    scanners = tuple((name, SCANNER) for name in (SLOWED, PLACE, SCAN + PLACE))
+    monitor = dataclasses.replace(MONITOR, scanners=scanners, odometry="odometry")
+    assert len(monitor.memory()) == len(scanners) + 2
+    seen = {**{name: wall(3.0) for name, _ in scanners}, "odometry": jnp.zeros(5)}
+    _, memory = monitor.slowed(jnp.array([0.8, 0.0]), STANDS, seen, monitor.memory())
+    shapes = {name: value.shape for name, value in monitor.memory().items()}
+    assert {name: value.shape for name, value in memory.items()} == shapes

@@ -30,6 +30,8 @@ SLOWED = "slowed"
 """Name of the share of the commands (1,) that things which come have taken away."""
 PLACE = "place"
 """Name of the vehicle's pose (3,) in its odometry at the scan before."""
+SCAN = "scan_"
+"""Put before the names of scanners, which people choose: none is then one of both above."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Monitor:
 
     def memory(self) -> dict[str, jax.Array]:
         """What is remembered at the start of an episode, all zeros: no scan of any scanner, and not slowed."""
-        scans = {name: jnp.zeros(one.rays) for name, one in self.scanners}
+        scans = {SCAN + name: jnp.zeros(one.rays) for name, one in self.scanners}
         return {**scans, SLOWED: jnp.zeros(1), **({PLACE: jnp.zeros(3)} if self.odometry else {})}
 
     def slowed(self, command: jax.Array, last: jax.Array, seen: Mapping[str, jax.Array],
@@ -74,14 +76,14 @@ class Monitor:
             memory: after the scan before; zeros where there was none.
         """
         moved = self._moved(last, seen, memory)
-        found = [self._points(one, seen[name], memory[name], moved) for name, one in self.scanners]
+        found = [self._points(one, seen[name], memory[SCAN + name], moved) for name, one in self.scanners]
         points, comes = (jnp.concatenate(parts) for parts in zip(*found, strict=True))
         slowed = jnp.maximum(1.0 - self._time_left(points, comes), memory[SLOWED][0] - self.seconds / self.time)
         eased = (1.0 - slowed) * command
         ways = eased * jnp.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
         allowed = jax.vmap(lambda way: way * self._share(way, points, comes))(ways)
         lost = jnp.sum(((allowed - eased) * jnp.array([1.0, self.half_length])) ** 2, -1)
-        after = {**{name: seen[name] for name, _ in self.scanners}, SLOWED: slowed[None]}
+        after = {**{SCAN + name: seen[name] for name, _ in self.scanners}, SLOWED: slowed[None]}
         if self.odometry:
             after[PLACE] = seen[self.odometry][:3]
         other = jnp.where(lost[1] <= lost[2], allowed[1], allowed[2])
