@@ -26,12 +26,10 @@ NEIGHBOURS = 2
 """Rays to either side in which a thing may have been before: its edge, or a ray that was lost."""
 SLOWEST, FASTEST = 0.3, 2.0
 """Speeds with which things come [m/s]: less is the noise of two scans, and more a thing that was hidden before."""
-SLOWED = "slowed"
-"""Name of the share of the commands (1,) that things which come have taken away."""
 PLACE = "place"
 """Name of the vehicle's pose (3,) in its odometry at the scan before."""
 SCAN = "scan_"
-"""Put before the names of scanners, which people choose: none is then one of both above."""
+"""Put before the names of scanners, which people choose: none is then the one above."""
 
 
 @dataclass(frozen=True)
@@ -55,19 +53,18 @@ class Monitor:
     """Name of the observation that tells where the vehicle is; None takes what the last command would have moved it."""
 
     def memory(self) -> dict[str, jax.Array]:
-        """What is remembered at the start of an episode, all zeros: no scan of any scanner, and not slowed."""
+        """What is remembered at the start of an episode, all zeros: no scan of any scanner."""
         scans = {SCAN + name: jnp.zeros(one.rays) for name, one in self.scanners}
-        return {**scans, SLOWED: jnp.zeros(1), **({PLACE: jnp.zeros(3)} if self.odometry else {})}
+        return scans | ({PLACE: jnp.zeros(3)} if self.odometry else {})
 
     def slowed(self, command: jax.Array, last: jax.Array, seen: Mapping[str, jax.Array],
                memory: Mapping[str, jax.Array]) -> tuple[jax.Array, dict[str, jax.Array]]:  # fmt: skip
         """The nearest to the command (2,) of: the same curve more slowly; straight on; a turn on the spot. And the
         memory after it.
 
-        A thing lies on the way where the vehicle would meet it within twice the `time`, if both went on like this. The
-        vehicle's border may near such a thing, at distance d and coming with speed w, by (d - margin) / time - w.
-        Where something comes, wherever it is, the command is eased to (d - margin) / (w time) of it, so that the
-        vehicle stands before it is touched. From that it recovers within the `time`.
+        The vehicle's border may near a thing that lies on the way or comes, at distance d and with speed w, by
+        (d - margin) / time - w, and away from it as fast as it wants. A thing lies on the way where the vehicle would
+        meet it within twice the `time`, if both went on like this.
 
         Args:
             command: (2,) speed [m/s] and yaw rate [rad/s] that are wanted.
@@ -78,12 +75,10 @@ class Monitor:
         moved = self._moved(last, seen, memory)
         found = [self._points(one, seen[name], memory[SCAN + name], moved) for name, one in self.scanners]
         points, comes = (jnp.concatenate(parts) for parts in zip(*found, strict=True))
-        slowed = jnp.maximum(1.0 - self._time_left(points, comes), memory[SLOWED][0] - self.seconds / self.time)
-        eased = (1.0 - slowed) * command
-        ways = eased * jnp.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
+        ways = command * jnp.array([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
         allowed = jax.vmap(lambda way: way * self._share(way, points, comes))(ways)
-        lost = jnp.sum(((allowed - eased) * jnp.array([1.0, self.half_length])) ** 2, -1)
-        after = {**{SCAN + name: seen[name] for name, _ in self.scanners}, SLOWED: slowed[None]}
+        lost = jnp.sum(((allowed - command) * jnp.array([1.0, self.half_length])) ** 2, -1)
+        after = {SCAN + name: seen[name] for name, _ in self.scanners}
         if self.odometry:
             after[PLACE] = seen[self.odometry][:3]
         other = jnp.where(lost[1] <= lost[2], allowed[1], allowed[2])
@@ -97,29 +92,18 @@ class Monitor:
         was, now = memory[PLACE], seen[self.odometry][:3]
         return jnp.concatenate([to_body(was, now[:2]), now[2:] - was[2:]])
 
-    def _apart(self, points: jax.Array, comes: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """Of points (N, 2) [m] with velocities (N, 2) [m/s]: the border's nearest points (N, 2) m, the ways from there
-        (N, 2) m, their lengths (N,) m, and the speeds (N,) m/s with which the points come."""
+    def _share(self, command: jax.Array, points: jax.Array, comes: jax.Array) -> jax.Array:
+        """() of a command (2,) that is left before points (N, 2) [m] with velocities (N, 2) [m/s]."""
         half = jnp.array([self.half_length, self.half_width])
         border = jnp.clip(points, -half, half)
         away = points - border
         apart = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
-        return border, away, apart, -jnp.sum(comes * away, -1) / apart
-
-    def _time_left(self, points: jax.Array, comes: jax.Array) -> jax.Array:
-        """() share of the `time` until something comes within the margin; 1 where it takes longer, or nothing comes."""
-        _, _, apart, toward = self._apart(points, comes)
-        left = (apart - self.margin) / (self.time * jnp.maximum(toward, 1e-6))
-        return jnp.clip(jnp.min(jnp.where(toward > SLOWEST, left, 1.0)), 0.0, 1.0)
-
-    def _share(self, command: jax.Array, points: jax.Array, comes: jax.Array) -> jax.Array:
-        """() of a command (2,) that is left before points (N, 2) [m] with velocities (N, 2) [m/s]."""
-        border, away, apart, toward = self._apart(points, comes)
+        toward = -jnp.sum(comes * away, -1) / apart
         arm = border - jnp.array([self.turns_at, 0.0])
         speed = jnp.stack([command[0] - command[1] * arm[:, 1], command[1] * arm[:, 0]], -1)
         nears = jnp.sum(speed * away, -1) / apart
         allowed = jnp.maximum((apart - self.margin) / self.time - jnp.maximum(toward, 0.0), 0.0)
-        slower = self._on_the_way(command, points, comes) & (nears > allowed)
+        slower = (self._on_the_way(command, points, comes) | (toward > SLOWEST)) & (nears > allowed)
         return jnp.min(jnp.where(slower, allowed / jnp.maximum(nears, 1e-6), 1.0))
 
     def _points(self, scanner: Lidar, distances: jax.Array, before: jax.Array,
