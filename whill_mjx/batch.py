@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from whill_mjx.devices import platform
 from whill_mjx.env import (
     Env,
     Outcome,
@@ -132,7 +133,7 @@ class BatchEnv:
         return state, time_step(obs, outcome, jnp.ones(keys.shape[:1], bool))
 
     def _step(self, state: BatchState, actions: jax.Array) -> tuple[BatchState, TimeStep]:
-        few = jax.default_backend() == "cpu" and actions.shape[0] > FEW
+        few = platform() == "cpu" and actions.shape[0] > FEW
         state, outcome, first = (self._advance_few if few else jax.vmap(self._advance))(state, actions)
         state, obs = self._sense(state)  # once, after the choice between step and reset
         return state, time_step(obs, outcome, first)

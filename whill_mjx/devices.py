@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import jax
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 LAUNCHERS = {
     "SLURM_STEP_NUM_TASKS": "SLURM", "OMPI_COMM_WORLD_SIZE": "Open MPI", "PMI_SIZE": "MPI", "JAX_NUM_PROCESSES": "JAX",
@@ -67,7 +72,47 @@ def choose_devices(count: int | None) -> tuple[jax.Device, ...]:
     return chosen if len(chosen) > 1 else ()
 
 
+def platform() -> str:
+    """Where programs are compiled now: "cpu", "gpu", ... of `jax.default_device`, or else JAX's own choice."""
+    device = jax.config.jax_default_device  # type: ignore[attr-defined]
+    if device is None:
+        return jax.default_backend()
+    return device if isinstance(device, str) else device.platform
+
+
+def find_device(name: str | None) -> jax.Device | None:
+    """The first device of a platform ("cpu", "gpu"); None, JAX's own choice, where that is it or nothing is named.
+
+    Raises:
+        ValueError: JAX has no such device here.
+    """
+    if name is None or name == jax.default_backend():
+        return None
+    try:
+        return jax.local_devices(backend=name)[0]
+    except RuntimeError as error:
+        if name == "cpu":
+            return None  # JAX_PLATFORMS leaves it out
+        raise ValueError(f"device is {name!r}, which JAX does not have here ({error}). Give None for its own choice "
+                         f"({jax.default_backend()}).") from error  # fmt: skip
+
+
+def held_to(device: jax.Device | None, function: Callable[P, R]) -> Callable[P, R]:
+    """`function`, such as one that `jax.jit` made, with all that it computes on a device; None changes nothing."""
+    if device is None:
+        return function
+
+    @wraps(function)
+    def there(*args: P.args, **kwargs: P.kwargs) -> R:
+        with jax.default_device(device):
+            return function(*args, **kwargs)
+
+    return there
+
+
 def runs_triton() -> bool:
-    """Whether the default device is an NVIDIA GPU for which our kernels are written: Ampere or later."""
+    """Whether programs are compiled now for an NVIDIA GPU of which our kernels are: Ampere or later."""
+    if platform() == "cpu":
+        return False
     capability = str(getattr(jax.devices()[0], "compute_capability", ""))
     return capability.replace(".", "", 1).isdigit() and float(capability) >= 8.0

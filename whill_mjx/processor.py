@@ -88,7 +88,9 @@ def as_one_function(function: Callable[..., Any]) -> Callable[..., Any]:
     import jax
     from jax.experimental.xla_metadata import set_xla_metadata
 
-    if jax.default_backend() != "cpu":
+    from whill_mjx.devices import platform
+
+    if platform() != "cpu":
         return function
 
     def marked(*args: Any) -> Any:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.batch import BatchEnv, BatchState, make_batch
+from whill_mjx.devices import find_device, held_to
 from whill_mjx.env import EVENT_METRICS, POSE_METRICS, make_env, observe
 from whill_mjx.evaluation.conditions import NAMES, Condition, arranged, begin_under, nominal
 from whill_mjx.io.fields import CONDITION, check, shown
@@ -42,6 +43,8 @@ class Kind:
     """Compiled once per process and number of instances."""
 
     batch: BatchEnv
+    device: jax.Device | None
+    """Where all of it is computed; None takes JAX's own choice."""
     observation_space: gymnasium.Space
     action_space: gymnasium.spaces.Box
 
@@ -58,12 +61,12 @@ class Kind:
         def begin(number: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
             return strong(self._begin_one(jax.random.key(number), condition))
 
-        return _program(begin)
+        return self._program(begin)
 
     @cached_property
     def step(self) -> Any:
         """(state, action) -> state and time step of one instance."""
-        return _program(lambda state, action: strong(self.batch.step_one(state, action)))
+        return self._program(lambda state, action: strong(self.batch.step_one(state, action)))
 
     @cached_property
     def reset_all(self) -> Any:
@@ -72,17 +75,17 @@ class Kind:
         def begin(numbers: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
             return strong(jax.vmap(lambda number: self._begin_one(jax.random.key(number), condition))(numbers))
 
-        return _program(begin)
+        return self._program(begin)
 
     @cached_property
     def step_all(self) -> Any:
         """(state, actions (N, 2)) -> state and time steps; nothing begins anew."""
-        return _program(lambda state, actions: strong(jax.vmap(self.batch.step_one)(state, actions)))
+        return self._program(lambda state, actions: strong(jax.vmap(self.batch.step_one)(state, actions)))
 
     @cached_property
     def step_or_reset(self) -> Any:
         """(state, actions (N, 2)) -> state and time steps; instances that have ended begin a new episode instead."""
-        return _program(lambda state, actions: strong(self.batch.step(state, actions)))
+        return self._program(lambda state, actions: strong(self.batch.step(state, actions)))
 
     @cached_property
     def restart(self) -> Any:
@@ -96,12 +99,12 @@ class Kind:
 
             return strong(jax.tree.map(choose, fresh, (state, steps)))
 
-        return _program(begin)
+        return self._program(begin)
 
     @cached_property
     def picture(self) -> Any:
         """State -> camera image (H, W, 3) uint8 of one instance."""
-        return _program(lambda state: observe(self.batch.env, state.env))
+        return self._program(lambda state: observe(self.batch.env, state.env))
 
     def _begin_one(self, origin: jax.Array, condition: Condition | None) -> tuple[BatchState, TimeStep]:
         if condition is None:
@@ -111,10 +114,9 @@ class Kind:
             origin, lambda params, state: begin_under(condition, env, params, state)
         )
 
-
-def _program(function: Callable[..., Any]) -> Any:
-    """`function` compiled; Python collects no garbage while JAX traces it."""
-    return jax.jit(undisturbed(function))
+    def _program(self, function: Callable[..., Any]) -> Any:
+        """`function` compiled; Python collects no garbage while JAX traces it."""
+        return held_to(self.device, jax.jit(undisturbed(function)))
 
 
 def strong(tree: Any) -> Any:
@@ -198,13 +200,14 @@ def check_process() -> None:
 
 
 def _make_kind(arguments: dict[str, Any]) -> Kind:
-    spread = arguments.pop("spread", 0.0)
-    env, params = make_env(**arguments)
-    same = _static(env, params, spread)
+    spread, device = arguments.pop("spread", 0.0), find_device(arguments.pop("device", None))
+    env, params = held_to(device, make_env)(**arguments)
+    same = (device, *_static(env, params, spread))
     if same in _KINDS:
         return _KINDS[same]
     actions = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    _KINDS[same] = Kind(make_batch(env, params, 1, spread), space_of(env), actions)
+    batch = held_to(device, make_batch)(env, params, 1, spread)
+    _KINDS[same] = Kind(batch, device, space_of(env), actions)
     return _KINDS[same]
 
 

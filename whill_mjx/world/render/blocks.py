@@ -7,6 +7,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from whill_mjx.devices import platform
+
 BLOCK = 16
 """Images of a block: of 64x64 pixels, a quarter of a megabyte for each number of a pixel."""
 
@@ -19,7 +21,7 @@ def in_blocks(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
     a single image, or several whole images under `vmap`. The result has no derivative.
     `function` gets every array as an argument: one that it closes over is lost under `vmap` of a loop.
     """
-    if jax.default_backend() != "cpu":
+    if platform() != "cpu":
         return function
 
     @jax.custom_batching.custom_vmap
