@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.world.maps.field import DistanceField, distance_at
-from whill_mjx.world.maps.walls import cast
+from whill_mjx.world.maps.walls import to_first_wall
 from whill_mjx.world.scene import Boxes, Scene
 from whill_mjx.world.solids import Rounds
 
@@ -20,6 +20,8 @@ TRACES = 64
 """Steps of the sphere tracing."""
 FARTHEST = 100.0
 """Longest ray that is traced [m]."""
+AT_A_TIME = 8
+"""Cylinders and capsules that are met in one round of a loop."""
 CLOSE = 1e-3
 """Distance at which a traced ray has arrived [m]."""
 
@@ -90,13 +92,13 @@ def first_hits(
     if walls is not None:
         boxes = jax.tree.map(lambda leaf: leaf[: leaf.shape[0] - walls.keep], boxes)  # the rest are pictures of walls
         if height <= walls.height:
-            nearest = cast(jnp.asarray(walls.segments), x[:, None], y[:, None], angle)[0]
+            nearest = to_first_wall(jnp.asarray(walls.segments), x, y, angle)
     if boxes.mask.shape[0]:
         nearest = jnp.minimum(nearest, _to_boxes(boxes, x, y, angle, height))
     if scene.solids is not None and scene.solids.rounds is not None:
         origin = jnp.stack([x, y, jnp.full(x.shape, height)], -1)
         way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(angle.shape)], -1)
-        nearest = jnp.minimum(nearest, round_hits(scene.solids.rounds, origin, way).min(-1, initial=jnp.inf))
+        nearest = jnp.minimum(nearest, _to_rounds(scene.solids.rounds, origin, way))
     if field is not None:
         nearest = jnp.minimum(nearest, trace(field, x, y, angle))
     return nearest
@@ -117,6 +119,20 @@ def _to_boxes(boxes: Boxes, x, y, angle, height) -> jax.Array:
         leave = jnp.minimum(leave, jnp.maximum(one, other))
     cut = boxes.mask & (jnp.abs(height - boxes.centre[:, 2]) <= boxes.half[:, 2])
     return jnp.min(jnp.where((enter <= leave) & cut, enter, jnp.inf), -1, initial=jnp.inf)
+
+
+def _to_rounds(rounds: Rounds, origin: jax.Array, way: jax.Array) -> jax.Array:
+    """(R,) m to the first cylinder or capsule, some of them at a time."""
+    count = rounds.mask.shape[0]
+    size = min(count, AT_A_TIME)  # the last of them may be met twice
+
+    def some(number: jax.Array, nearest: jax.Array) -> jax.Array:
+        first = jnp.minimum(number * size, count - size)
+        part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), rounds)
+        return jnp.minimum(nearest, round_hits(part, origin, way).min(-1))
+
+    nearest = jnp.full(way.shape[:1], jnp.inf)
+    return jax.lax.fori_loop(0, -(-count // size), some, nearest) if count else nearest
 
 
 def round_hits(rounds: Rounds, origin: jax.Array, way: jax.Array) -> jax.Array:
