@@ -19,6 +19,11 @@ MAX_SIDE = 8192
 YUV_TO_RGB = np.array([[1.164384, 0.0, 1.596027], [1.164384, -0.391762, -0.812968], [1.164384, 2.017232, 0.0]],
                       np.float32)
 """ITU-R BT.601, luma from 16 to 235: red, green, blue from Y - 16, U - 128, V - 128."""
+AT_A_TIME = 8
+"""Rows or columns of a result that are averaged in one product."""
+ALONE = 2**18
+"""Multiplications of a matrix product up to which OpenBLAS takes no second thread. The threads of larger ones wait for
+each other: they doubled the time from an image of 1280x720 to its command."""
 IMAGE_ENDS = (b"\xff\xd9", b"IEND\xaeB`\x82")
 """Last bytes of a JPEG and of a PNG."""
 
@@ -79,7 +84,7 @@ def to_rgb8(image: RawImage, size: tuple[int, int] = (64, 64), crop: Crop | None
         return yuv422_to_rgb8(pixels, encoding in ("yuv422", "uyvy"), size)
     if channels == 1:
         return np.repeat(area_resize(pixels, size), 3, axis=2)
-    small = area_resize(pixels, size)[:, :, :3]
+    small = area_resize(pixels[:, :, :3], size)  # alpha has no part
     return np.ascontiguousarray(small[:, :, ::-1] if encoding.startswith("bgr") else small)
 
 
@@ -198,23 +203,38 @@ def area_mean(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if image.shape[0] % height == 0 and image.shape[1] % width == 0:
         blocks = image.reshape(height, image.shape[0] // height, width, image.shape[1] // width, channels)
         return blocks.mean(axis=(1, 3), dtype=np.float32)
-    rows = _row_sums(image, height).reshape(height, -1, channels)
-    columns = _weights(image.shape[1], width).T  # (width_in, W)
+    rows = _row_means(image, height)
     means = np.empty((height, width, channels), np.float32)
-    for channel in range(channels):  # one product for each takes less than one for each row
-        means[:, :, channel] = np.ascontiguousarray(rows[:, :, channel]) @ columns
+    for channel in range(channels):
+        one = np.ascontiguousarray(rows[:, :, channel])
+        for outputs, inputs, weights in _bands(image.shape[1], width):
+            means[:, outputs, channel] = one[:, inputs] @ weights.T
     return means
 
 
-def _row_sums(image: np.ndarray, height: int) -> np.ndarray:
-    """Return (height, width_in * C) float32, the weighted mean of the rows; a band of rows at a time."""
-    flat = image.reshape(image.shape[0], -1)
-    weights = _weights(image.shape[0], height)
-    out = np.empty((height, flat.shape[1]), np.float32)
-    for i, row in enumerate(weights):
-        (used,) = np.nonzero(row)
-        out[i] = row[used] @ flat[used[0] : used[-1] + 1].astype(np.float32)
+def _row_means(image: np.ndarray, height: int) -> np.ndarray:
+    """Return (height, width_in, C) float32, the weighted mean of the rows; a strip of a band at a time."""
+    _, width, channels = image.shape
+    out = np.empty((height, width, channels), np.float32)
+    for outputs, inputs, weights in _bands(image.shape[0], height):
+        strip = max(1, ALONE // (weights.size * channels))
+        for first in range(0, width, strip):
+            part = image[inputs, first : first + strip].astype(np.float32)
+            sums = weights @ part.reshape(len(part), -1)
+            out[outputs, first : first + strip] = sums.reshape(len(weights), -1, channels)
     return out
+
+
+@lru_cache(maxsize=32)
+def _bands(source: int, target: int) -> tuple[tuple[slice, slice, np.ndarray], ...]:
+    """Return target cells, the source cells under them and their weights (targets, sources); some at a time."""
+    found = []
+    for first in range(0, target, AT_A_TIME):
+        weights = _weights(source, target)[first : first + AT_A_TIME]
+        (used,) = np.nonzero(weights.any(axis=0))
+        inputs = slice(used[0], used[-1] + 1)
+        found.append((slice(first, first + len(weights)), inputs, np.ascontiguousarray(weights[:, inputs])))
+    return tuple(found)
 
 
 @lru_cache(maxsize=16)
