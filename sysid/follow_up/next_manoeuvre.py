@@ -124,10 +124,14 @@ def _refitted(result: Result, refitter: Refitter, number: int, rivals: Sequence[
 
 
 def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[PlannedDrive]:
-    """Every manoeuvre at several sizes and start headings [degrees], within speeds, space and time of the training."""
-    trials = result.log.training
-    v = max(max(float(trial.command.v.max()) for trial in trials), 0.1)
-    omega = max(float(np.abs(trial.command.omega).max()) for trial in trials) or min(result.log.spec.omega_max, 0.5)
+    """Every manoeuvre at several sizes and start headings [degrees], within speeds, space and time of the training.
+
+    A training that never drove ahead or back, or never turned, says nothing of that speed: 0.1 m/s and 0.5 rad/s then,
+    or the vehicle's limit where that is less.
+    """
+    trials, spec = result.log.training, result.log.spec
+    v = max(float(np.abs(trial.command.v).max()) for trial in trials) or min(spec.v_max, 0.1)
+    omega = max(float(np.abs(trial.command.omega).max()) for trial in trials) or min(spec.omega_max, 0.5)
     longest = max(trial.duration for trial in trials)
     steps = np.concatenate([np.diff(trial.command.t) for trial in trials])
     dt = round(float(np.clip(np.median(steps), 0.02, 0.2)), 3)
@@ -135,8 +139,8 @@ def drive_library(result: Result, headings: Sequence[float] = HEADINGS) -> list[
     found: dict[tuple[Any, ...], PlannedDrive] = {}
     for name in (*MANOEUVRES, *OWN):
         for size in SIZES if name != "standstill" else SIZES[:1]:
-            speed = min(size * v, -result.log.spec.v_min) if name in REVERSING else size * v
-            if speed < 0.02:
+            speed = min(size * v, -spec.v_min if name in REVERSING else spec.v_max)
+            if speed <= 0.0:
                 continue
             for heading in headings:
                 start = (0.0, 0.0, math.radians(heading))

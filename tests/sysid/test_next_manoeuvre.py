@@ -182,6 +182,20 @@ def test_the_library_keeps_to_the_speeds_and_the_space_of_the_log(subject):
 
 
 @quick
+@pytest.mark.parametrize("share", [0.08, -1.0])
+def test_a_slow_log_and_one_that_only_reverses_get_drives_of_their_own_speed(subject, share):
+    trial = subject.log.training[0]
+    log = replace_command(subject.log, replace(trial.command, v=share * trial.command.v))
+    library = drive_library(SimpleNamespace(**{**vars(subject), "log": log}))
+    assert max(np.abs(one.command.v).max() for one in library) == pytest.approx(abs(share) * SPEED)
+
+
+def replace_command(log, command):
+    """A log of one trial, with other commands."""
+    return SimpleNamespace(**{**vars(log), "training": (replace(log.training[0], command=command),)})
+
+
+@quick
 def test_what_another_coordinate_can_absorb_does_not_count():
     random = np.random.default_rng(0)
     columns = random.standard_normal((50, 3))
