@@ -49,8 +49,8 @@ class InspectConfig:
     json: bool = False
     """Print JSON instead of text."""
     out: Path | None = None
-    """Folder for inspect.html, .txt, .json, .png and scripts of the next three drives; without one, the picture of a
-    robot file goes to the current folder."""
+    """Folder for inspect.html, .txt, .json, .png and scripts of the next three drives, or for the picture of a robot
+    file; without one, nothing is written."""
     space: Annotated[tuple[float, float], Range(0.1, 10_000)] = (4.0, 4.0)
     """Length and width of the free floor for the next drives [m]."""
     v_max: Annotated[float | None, POSITIVE] = None
@@ -61,10 +61,7 @@ class InspectConfig:
 
 
 def inspect_robot(config: InspectConfig) -> dict[str, Any]:
-    """What a robot file is understood as: printed, with a picture.
-
-    Without --out a picture that cannot be written is only said so; it is refused where somebody asked for it.
-    """
+    """What a robot file is understood as: printed, and with --out drawn."""
     from dataclasses import asdict
 
     from sysid.pages.report import plain
@@ -72,23 +69,17 @@ def inspect_robot(config: InspectConfig) -> dict[str, Any]:
     from sysid.replay.robot_check import check_robot, describe_robot
     from sysid.replay.robot_loading import load_robot
 
-    picture = (config.out or Path()) / f"{config.dataset.name.partition('.')[0]}.png"
     robot = load_robot(config.dataset, config.wheels)
     check = check_robot(robot)
     found = {"wheel_radius": robot.wheel_radius, "track": robot.distance, "driven_wheels": len(robot.wheels),
              "mass": float(robot.host.body_mass.sum()), "notes": list(robot.notes), **asdict(check),
              "drives_straight": check.drives_straight}
     print(json.dumps(plain(found), indent=1) if config.json else "\n".join(describe_robot(robot, check)))
-    try:
-        if config.out is None:
-            check_file("picture", picture, "give --out FOLDER")
-        else:
-            check_file("--out", picture, "choose another --out")
-    except OptionError as refused:
-        if config.out is not None:
-            raise
-        print(f"no {refused}", file=sys.stderr)
+    if config.out is None:
+        print("--out FOLDER draws it", file=sys.stderr)
         return found
+    picture = config.out / f"{config.dataset.name.partition('.')[0]}.png"
+    check_file("--out", picture, "choose another --out")
     write_robot(picture, robot, check.loads)
     note_written(picture)
     print(f"wrote {picture}", file=sys.stderr)

@@ -247,14 +247,15 @@ def test_inspect_says_what_was_understood_and_draws_it(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["driven_wheels"] == 2
 
 
-def test_what_was_found_of_a_robot_is_printed_although_its_picture_is_somebodys(tmp_path, capsys, monkeypatch):
+def test_a_robot_is_drawn_where_somebody_asks_for_it_and_nowhere_else(tmp_path, capsys, monkeypatch):
     path = robot_file(tmp_path, *TWO)
-    (tmp_path / "robot.png").write_text("mine")
     monkeypatch.chdir(tmp_path)
+    before = set(tmp_path.iterdir())
     inspect_module.main(inspect_module.InspectConfig(dataset=path, json=True))
     said = capsys.readouterr()
-    assert json.loads(said.out)["driven_wheels"] == 2
-    assert "no picture robot.png: exists already" in said.err and "give --out FOLDER, or remove it" in said.err
+    assert json.loads(said.out)["driven_wheels"] == 2 and "--out FOLDER draws it" in said.err
+    assert set(tmp_path.iterdir()) == before
+    (tmp_path / "robot.png").write_text("mine")
     with pytest.raises(FolderRefused, match="choose another --out, or remove it"):
         inspect_module.main(inspect_module.InspectConfig(dataset=path, json=True, out=tmp_path))
     assert json.loads(capsys.readouterr().out)["driven_wheels"] == 2
