@@ -106,6 +106,18 @@ def test_an_action_that_is_no_number_is_standstill_and_ends_the_episode(course, 
     assert np.isfinite(float(outcome.reward))
 
 
+@pytest.mark.parametrize(("roll", "over"), [(60.0, False), (120.0, True)])
+def test_a_vehicle_that_has_fallen_over_ends_the_episode_as_diverged(course, roll, over):
+    _, params, begin, advance = course
+    state = begin(params, jax.random.key(0))
+    half = np.radians(roll) / 2
+    qpos = state.vehicle.qpos.at[3:7].set(jnp.array([np.cos(half), np.sin(half), 0.0, 0.0])).at[2].add(1.0)
+    fallen = dataclasses.replace(state, vehicle=dataclasses.replace(state.vehicle, qpos=qpos))
+    after, outcome = advance(params, fallen, jnp.zeros(2))
+    assert bool(after.vehicle.diverged) == over and bool(outcome.terminated) == over
+    assert outcome.metrics["diverged"] == over and outcome.metrics["collision"] == 0
+
+
 def test_other_parameters_and_worlds_need_no_second_compilation(course):
     _, params, begin, advance = course
     advance(params, begin(params, jax.random.key(0)), jnp.array([1.0, 0.0]))

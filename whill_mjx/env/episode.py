@@ -147,7 +147,7 @@ def _control_period(
     """One control period, its reward and whether it ended the episode; an `unreadable` action () ends it."""
     task = env.task
     vehicle = drive(env.model, on_ground(params, state.scene.ground), state.vehicle, command)
-    vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable)
+    vehicle = dataclasses.replace(vehicle, diverged=vehicle.diverged | unreadable | _lies_on_its_back(vehicle.qpos))
     scene, vehicle, collided = _stopped(env, state, vehicle)
     state = dataclasses.replace(state, scene=scene)
     step_count = state.step_count + 1
@@ -175,6 +175,11 @@ def _control_period(
     outcome = Outcome(reward, terminated, truncated, ends | pose_metrics(env, after) | event_metrics(after))
     still = (state, first_outcome(env, state, ends))  # after the end nothing moves, and the end is reported once
     return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), still, (after, outcome))
+
+
+def _lies_on_its_back(qpos: jax.Array) -> jax.Array:
+    """() whether the chassis' upward axis points below the horizon."""
+    return qpos[4] ** 2 + qpos[5] ** 2 > 0.5
 
 
 def _finite(reward: jax.Array, moment: Moment) -> tuple[jax.Array, Moment]:
