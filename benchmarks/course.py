@@ -1,7 +1,7 @@
 """The paper's two trainings with every seed shown, and the planner that is the course's ceiling.
 
     python -m benchmarks.course run --seed 0 --out runs/course/0 [--preset cpu] [--layout fixed] [--vehicle FILE]
-    python -m benchmarks.course run --task corridor --seed 0 --out runs/corridor/0
+    python -m benchmarks.course run --task corridor --seed 0 --out runs/corridor/0 [--spread 0.1]
     python -m benchmarks.course run --preset wallclock [--learner ppo] --seed 0 --out runs/wallclock/0
     python -m benchmarks.course together --seeds 0 1 2 --out runs/course/fixed --layout fixed    # in one program
     python -m benchmarks.course collect --runs runs/course/*      # into benchmarks/results/course.json, with a plot
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
         seed=options.seed, steps=options.steps, targets=options.targets, train_ratio=options.ratio,
         action_repeat=options.repeat, exploring_starts=options.starts, learner=options.learner, lr=options.lr,
         second_tries=options.second_tries, change=tuple(options.change), instances=options.instances,
-        eval_every=options.eval_every,
+        eval_every=options.eval_every, spread=options.spread,
         export="best" if preset == "cpu" else "last",
         episodes=options.episodes, videos=0, checkpoint_every_s=options.checkpoint_s, planner=options.planner,
     )  # fmt: skip
@@ -69,17 +69,21 @@ def run(options: argparse.Namespace) -> None:
     note = {"device": device_name(), "preset": preset, "layout": options.layout, "seed": options.seed}
     if options.beside:
         note["together"] = 1 + options.beside
+    if options.spread:
+        note["spread"] = options.spread
     write_json(options.out / "course.json", {**note, **result})
     if not (options.out / "policy").exists():
         print("no proofs of sight: there is no policy file", flush=True)
         return
-    evaluated = evaluation_command.main(
-        evaluation_command.EvaluateOptions(
-            str(options.out / "policy"), out=options.out / "sight", episodes=options.episodes, layout=options.layout,
-            blind=BLIND, videos=0,
-        )
+    again = evaluation_command.EvaluateOptions(
+        str(options.out / "policy"), out=options.out / "sight", episodes=options.episodes, layout=options.layout,
+        blind=BLIND, videos=0,
     )  # fmt: skip
+    evaluated = evaluation_command.main(again)
     note["sight"] = {kind: evaluated["drivers"][f"policy {kind}"]["success"] for kind in BLIND}
+    if options.spread:  # the same worlds once more, each with a vehicle of its own
+        varied = dataclasses.replace(again, out=options.out / "varied", spread=options.spread, blind=())
+        note["varied"] = evaluation_command.main(varied)["drivers"]["policy"]
     write_json(options.out / "course.json", {**note, **result})
 
 
@@ -275,6 +279,8 @@ def parse() -> argparse.Namespace:
     one.add_argument("--starts", type=in_range(0, 1), help="share of exploring starts; the preset's unless given")
     one.add_argument("--second-tries", type=in_range(0, 1),
                      help="share of failed worlds begun again; the preset's unless given")
+    one.add_argument("--spread", type=in_range(0, 1),
+                     help="of the vehicle's parameters between training episodes; the preset's unless given")
     one.add_argument("--episodes", type=whole(), default=1000, help="of the final evaluation and the proofs of sight")
     one.add_argument("--no-planner", dest="planner", action="store_false", help="not beside the policy in the end")
     one.add_argument("--training-only", action="store_true", help="no final evaluation, policy file or proofs of sight")

@@ -65,8 +65,8 @@ def last_evaluation(path: Path, preset: dict[str, Any], metrics: list[dict[str, 
 def groups(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]], dict[str, Any]]]:
     """Trainings of one preset, layout and learner: a name for them, these, and their figures.
 
-    Figures of other presets, layouts and learners than the usual have other names; those of stopped runs end in
-    _stopped.
+    Figures of other presets, layouts and learners than the usual have other names; those of trainings with other
+    vehicles in each episode end in _dynamics, those of stopped runs in _stopped.
 
     Raises:
         ValueError: a run of the course that has to be whole was stopped, or its preset has no figures.
@@ -74,7 +74,8 @@ def groups(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any
     kinds: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for one in runs:
         corridor = "corridor" if is_corridor(one) else "course"
-        ending = LEARNERS[one.get("learner", "dreamer")] + ("_stopped" if one.get("stopped") else "")
+        ending = LEARNERS[one.get("learner", "dreamer")] + ("_dynamics" if one.get("spread") else "")
+        ending += "_stopped" if one.get("stopped") else ""
         kinds.setdefault((corridor, one["preset"], one["layout"], ending), []).append(one)
     for (world, preset, layout, ending), mine in kinds.items():
         if world == "corridor":
@@ -151,9 +152,19 @@ def corridor_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "success": {**figure([one["policy"]["success"] for one in runs], "share", device), **episodes},
         "collisions": {**figure([one["policy"]["collision"] for one in runs], "share", device), **episodes},
+        **varied_figures(runs),
         **sight_figures(runs),
         **({"wallclock_s": figure(alone, "s", device)} if alone else {}),
     }
+
+
+def varied_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Success and collisions of each seed where every episode has a vehicle of its own, if they were driven so."""
+    if not all("varied" in one for one in runs):
+        return {}
+    device, spread = runs[0]["device"], [one["spread"] for one in runs]
+    return {f"{name}_varied": {**figure([one["varied"][key] for one in runs], "share", device), "spread": spread}
+            for name, key in (("success", "success"), ("collisions", "collision"))}
 
 
 def sight_figures(runs: list[dict[str, Any]], suffix: str = "") -> dict[str, Any]:
