@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bridge import parameters, ros
+from bridge import parameters, ros, scheduling
 from bridge.bases import BASES
 from bridge.commands import Endpoint, endpoints
 from bridge.controller import Caution, Controller
@@ -245,7 +245,9 @@ def main(arguments: list[str] | None = None) -> int:
     own, ros_arguments = ros.split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     try:
         options = parse_arguments(parameters.with_options(ros_arguments, ros.DRIVE_NAME, "policy", own))
-        policy = Policy.load(options.policy)
+        # First the scheduling, which the policy's second thread takes over. In the normal one a step takes one thread.
+        alone = bool(options.realtime) and scheduling.set_realtime(ros.DRIVE_NAME, options.realtime)
+        policy = Policy.load(options.policy, threads=2 if alone else 1)
         if options.joystick_lock and not options.require_arm:
             raise OptionError("--joystick-lock takes the joystick from the rider, so an operator must arm. Give "
                               "--require-arm too.")
@@ -260,7 +262,7 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         print(f"bridge.drive: {error}", file=sys.stderr)
         return refusal(error)
-    with ros.node_session(ros.DRIVE_NAME, ros_arguments, options.realtime, options.lifecycle) as node:
+    with ros.node_session(ros.DRIVE_NAME, ros_arguments, managed=options.lifecycle) as node:
         controller = Controller(policy, safety, caution=Caution(options.blind, options.novel),
                                 pace_by_stamp=options.pace == "stamp", view=view)
         drive = DriveNode(node, controller, options)

@@ -19,8 +19,9 @@ MAX_SIDE = 8192
 YUV_TO_RGB = np.array([[1.164384, 0.0, 1.596027], [1.164384, -0.391762, -0.812968], [1.164384, 2.017232, 0.0]],
                       np.float32)
 """ITU-R BT.601, luma from 16 to 235: red, green, blue from Y - 16, U - 128, V - 128."""
-AT_A_TIME = 8
-"""Rows or columns of a result that are averaged in one product."""
+ROWS, COLUMNS = 2, 8
+"""Rows and columns of a result that are averaged in one product. More of them share fewer pixels: most of the product
+is by zero. The rows take most of the time, and fewer columns make too many products."""
 ALONE = 2**18
 """Multiplications of a matrix product up to which OpenBLAS takes no second thread. The threads of larger ones wait for
 each other: they doubled the time from an image of 1280x720 to its command."""
@@ -207,7 +208,7 @@ def area_mean(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     means = np.empty((height, width, channels), np.float32)
     for channel in range(channels):
         one = np.ascontiguousarray(rows[:, :, channel])
-        for outputs, inputs, weights in _bands(image.shape[1], width):
+        for outputs, inputs, weights in _bands(image.shape[1], width, COLUMNS):
             means[:, outputs, channel] = one[:, inputs] @ weights.T
     return means
 
@@ -216,7 +217,7 @@ def _row_means(image: np.ndarray, height: int) -> np.ndarray:
     """Return (height, width_in, C) float32, the weighted mean of the rows; a strip of a band at a time."""
     _, width, channels = image.shape
     out = np.empty((height, width, channels), np.float32)
-    for outputs, inputs, weights in _bands(image.shape[0], height):
+    for outputs, inputs, weights in _bands(image.shape[0], height, ROWS):
         strip = max(1, ALONE // (weights.size * channels))
         for first in range(0, width, strip):
             part = image[inputs, first : first + strip].astype(np.float32)
@@ -226,11 +227,11 @@ def _row_means(image: np.ndarray, height: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _bands(source: int, target: int) -> tuple[tuple[slice, slice, np.ndarray], ...]:
-    """Return target cells, the source cells under them and their weights (targets, sources); some at a time."""
+def _bands(source: int, target: int, cells: int) -> tuple[tuple[slice, slice, np.ndarray], ...]:
+    """Return target cells, the source cells under them and their weights (targets, sources); `cells` at a time."""
     found = []
-    for first in range(0, target, AT_A_TIME):
-        weights = _weights(source, target)[first : first + AT_A_TIME]
+    for first in range(0, target, cells):
+        weights = _weights(source, target)[first : first + cells]
         (used,) = np.nonzero(weights.any(axis=0))
         inputs = slice(used[0], used[-1] + 1)
         found.append((slice(first, first + len(weights)), inputs, np.ascontiguousarray(weights[:, inputs])))

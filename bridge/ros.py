@@ -17,6 +17,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from bridge import scheduling
+
 # All names are relative, so a namespace or a remapping moves them: two bridges on one graph never share a topic.
 IMAGE_TOPIC = "sensing/camera/front/image_raw"
 GROUND_TRUTH_TOPIC = "ground_truth/odom"
@@ -58,16 +60,6 @@ def use_dds_profile(environment: MutableMapping[str, str] = os.environ) -> str:
             return environment[variable]
     environment[PROFILE_VARIABLES[0]] = str(PROFILE)
     return str(PROFILE)
-
-
-def set_realtime(name: str, priority: int) -> None:
-    """Run this thread, and those it starts, before all normal processes; say so where not permitted."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except (OSError, ValueError) as error:
-        print(f"{name}: --realtime {priority}: {error}. It needs a priority from 1 to 99 and the right to use it. "
-              "Run `setcap cap_sys_nice=ep` on the interpreter or raise rtprio in limits.conf; going on without.",
-              file=sys.stderr)
 
 
 def best_effort(depth: int = 1) -> Any:
@@ -305,7 +297,7 @@ def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bo
         managed: make it a lifecycle node.
     """
     if realtime:
-        set_realtime(name, realtime)
+        scheduling.set_realtime(name, realtime)
     use_dds_profile()
     try:
         import rclpy

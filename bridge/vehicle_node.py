@@ -316,7 +316,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="who sends commands on one of these topics drives, and an operator arms afterwards: of a "
                              "twist_mux, each source that goes before this node")
     parser.add_argument("--realtime", type=whole(0, 99), default=0, metavar="PRIORITY",
-                        help="SCHED_FIFO priority, like 20")
+                        help="SCHED_FIFO priority, like 20; it also keeps the processor awake")
     inputs.add_options(parser)
 
 

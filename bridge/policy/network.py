@@ -1,4 +1,4 @@
-"""Runs the network of a checked policy on one thread, in two halves where a part of it needs no observation."""
+"""Runs the network of a checked policy, in two halves where a part of it needs no observation."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -12,16 +12,16 @@ Arrays = Mapping[str, Any]
 class Network:
     """A recurrent network: what `early` gives depends on its state alone, and `late` needs it and the observations."""
 
-    def __init__(self, model: bytes, observations: Iterable[str]) -> None:
-        """Build the sessions of a serialised ONNX model, which was tried as a whole before."""
+    def __init__(self, model: bytes, observations: Iterable[str], threads: int = 1) -> None:
+        """Build the sessions of a serialised ONNX model, which was tried as a whole before, on so many threads."""
         self._halves: list[Any] = []
         try:
             cut = Cut(model, frozenset(observations))
-            first = build(cut.first())
+            first = build(cut.first(), threads)
             second = cut.second([_between(one) for one in first.get_outputs() if one.name in cut.between])
-            self._halves = [first, build(second)]
+            self._halves = [first, build(second, threads)]
         except Exception:  # also of onnxruntime, whose types all derive from Exception directly: the whole is sound
-            self._whole = build(model)
+            self._whole = build(model, threads)
 
     @property
     def in_halves(self) -> bool:
@@ -39,13 +39,13 @@ class Network:
         return {**early, **_run(self._halves[1], {**observed, **state, **early})}
 
 
-def build(model: bytes) -> Any:
-    """Return a session of onnxruntime for a serialised model."""
+def build(model: bytes, threads: int = 1) -> Any:
+    """Return a session of onnxruntime for a serialised model, of the calling thread and as many more as asked for."""
     import onnxruntime
 
     onnxruntime.set_default_logger_severity(3)
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1  # one thread has the lower tail latency on a vehicle's shared cores
+    options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

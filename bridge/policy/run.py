@@ -83,7 +83,8 @@ def make_session(policy: CheckedPolicy) -> Any:
 class Policy:
     """A recurrent policy of a vehicle. `step` maps what its sensors show to one command and advances the state."""
 
-    def __init__(self, contract: Contract | AgentContract, network: bytes, name: str = "policy") -> None:
+    def __init__(self, contract: Contract | AgentContract, network: bytes, name: str = "policy",
+                 threads: int = 1) -> None:
         """Build a policy from its ONNX model; its contract says what its actions and observations are."""
         commands, pacer = contract.commands, pacer_of(contract.sensors)
         assert commands is not None and pacer is not None
@@ -97,15 +98,20 @@ class Policy:
         self._state_names = [f"carry_{one.name}" for one in contract.carry] if agent else list(contract.inputs[1:])
         self._inputs = {one.name: one for one in inputs if one.name not in self._state_names}
         self._alone = next(iter(self._inputs)) if len(self._inputs) == 1 else ""
-        self._network = Network(network, self._inputs)
+        self._network = Network(network, self._inputs, threads)
         self._begin: Arrays | None = None  # of the zero state
         self.reset()
         self.prepare()
         self._begin = self._early
 
     @classmethod
-    def load(cls, path: str | Path) -> "Policy":
+    def load(cls, path: str | Path, threads: int = 1) -> "Policy":
         """Return the policy of a folder or zip, after checking hashes, version, shapes and one trial step.
+
+        Args:
+            path: folder or zip.
+            threads: on which a step is computed. Two take two thirds of the time, where no other process wants the
+                cores; where one does, the step waits for the slower of both.
 
         Raises:
             PolicyFileError: with the file, the field, the value, the rule and the remedy.
@@ -113,7 +119,7 @@ class Policy:
         checked = read_policy(path, (KIND, AGENT_KIND))
         contract = checked.contract
         _check_drives(f"{path}/{TABLE}", contract)
-        policy = cls(contract, checked.network, str(path))
+        policy = cls(contract, checked.network, str(path), threads)
         del checked
         _give_back_memory()
         policy.step(policy.zeros())  # the first step takes longest
