@@ -334,7 +334,7 @@ class SteadyRun:
         else:
             for name, share, more in (("p50", 50, (histogram(delays),)), ("p99", 99, ()), ("max", 100, ())):
                 figures[f"frame_to_command_{name}{suffix}_ms"] = (
-                    [float(np.percentile(delays, share))], f"ms, of {len(delays)} frames", *more)
+                    [float(np.percentile(delays, share))], f"ms, of {len(delays)} frames a drive", *more)
             figures[f"tick_error_p99{suffix}_ms"] = ([float(np.percentile(error, 99))], "ms")
             figures[f"drive_processor{suffix}_share"] = ([self._taken / seconds], "of a core, by the policy node")
         return figures, stops(drive), int((intervals > 150).sum())
@@ -347,6 +347,17 @@ def histogram(delays: np.ndarray) -> dict[str, list[float]]:
     return {"histogram_from_ms": [float(one) for one in bounds], "histogram_counts": [float(one) for one in counts]}
 
 
+def with_former(name: str, former: tuple, one: tuple) -> tuple:
+    """Return a figure of a drive with that of drives of the same kind before it: their median counts, of `max` the
+    largest.
+    """
+    values = former[0] + one[0]
+    counts = "histogram_counts"
+    more = [{**b, counts: [x + y for x, y in zip(a[counts], b[counts], strict=True)]}
+            for a, b in zip(former[2:], one[2:], strict=True)]
+    return [max(values)] if "_max_" in name else values, *former[1:2], *more
+
+
 def measure_steady(policy: Path, folder: Path, domain: int, seconds: float, kinds: Sequence[str], together: bool
                    ) -> Figures:
     """Return latency, pacing, delivery, spurious stops and memory of undisturbed drives.
@@ -356,7 +367,7 @@ def measure_steady(policy: Path, folder: Path, domain: int, seconds: float, kind
         folder: for the results of the nodes.
         domain: ROS domain of the first drive.
         seconds: of each drive.
-        kinds: which of `STEADY`.
+        kinds: which of `STEADY`, one after the other; of one that is named several times all drives count.
         together: drive all at once, each on two cores of its own, instead of one after another on all cores.
     """
     cores = sorted(os.sched_getaffinity(0))
@@ -374,7 +385,8 @@ def measure_steady(policy: Path, folder: Path, domain: int, seconds: float, kind
         for run in runs:
             run.mark()
             found, stopped, late = run.finish(seconds)
-            figures |= found
+            figures |= {name: with_former(name, figures[name], one) if name in figures else one
+                        for name, one in found.items()}
             if run.kind.healthy:
                 healthy_stops, missed, healthy = healthy_stops + stopped, missed + late, healthy + seconds
                 memory.append(run.memory[-1])
@@ -453,8 +465,8 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, help="policy file to measure; default: a stand-in of 10 M parameters")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--steady", nargs="+", choices=tuple(STEADY), default=tuple(STEADY),
-                        help="which steady runs; busy: beside two processes that take all they get; healthy: the "
-                             "one whose stops, late commands and memory are counted")
+                        help="which steady runs, also several times; busy: beside two processes that take all they "
+                             "get; healthy: the one whose stops, late commands and memory are counted")
     parser.add_argument("--together", action="store_true",
                         help="all steady runs at once, each on two cores of its own")
     parser.add_argument("--domain", type=whole(1, 95), help="first of six ROS domains; none takes one by the process")

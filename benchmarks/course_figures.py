@@ -28,7 +28,7 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
         ValueError: there is no note and no device is given; or there was no evaluation.
     """
     metrics = [line for _, line in read_lines(path / "metrics.jsonl")]
-    if (path / "course.json").exists():
+    if (path / "course.json").exists():  # what `benchmarks.course run` left at its end
         noted = json.loads((path / "run.json").read_text())["preset"] if (path / "run.json").exists() else {}
         starts = {"exploring_starts": noted["exploring_starts"]} if "exploring_starts" in noted else {}
         return {**starts, **json.loads((path / "course.json").read_text()), "metrics": metrics}
@@ -38,6 +38,8 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
     noted = {name: begun["command"][name] for name in ("preset", "layout", "seed", "learner")}
     noted["exploring_starts"] = begun["preset"]["exploring_starts"]
     content: dict[str, Any] = {"device": device, "together": 2, "metrics": metrics, **noted}
+    if begun["command"].get("spread"):
+        content["spread"] = begun["command"]["spread"]
     if (path / "evaluation.json").exists():
         return {**content, **json.loads((path / "evaluation.json").read_text())}
     last = last_evaluation(path, begun["preset"], metrics)
@@ -147,7 +149,7 @@ def corridor_figures(runs: list[dict[str, Any]]) -> dict[str, Any]:
     device = runs[0]["device"]
     alone = [training_s(one) for one in runs if "together" not in one]
     episodes = {"episodes": runs[0]["policy"]["episodes"], "env_steps": [one["env_steps"] for one in runs],
-                "updates": [one["updates"] for one in runs],
+                "updates": [one["updates"] for one in runs], "seeds": [one["seed"] for one in runs],
                 "evaluations": [evaluations(one) for one in runs]}  # fmt: skip
     return {
         "success": {**figure([one["policy"]["success"] for one in runs], "share", device), **episodes},

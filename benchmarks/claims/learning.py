@@ -308,13 +308,18 @@ CLAIMS = (
         TRAINING,
         "Corridor after 200,000 steps",
         "corridor",
-        "New corridors with random paint and light. DreamerV3: 1,000 episodes a seed; PPO: 200.",
+        "New corridors with random paint and light. DreamerV3: 1,000 episodes a seed; PPO: 200. Three seeds each, but "
+        "two with varied vehicles.",
         ("learner", "success", "range over seeds", "collisions", "training [s]"),
         (
             ("DreamerV3", "{success|%}", "{success|range %}", "{collisions|%}", "{wallclock_s}"),
+            (
+                "DreamerV3, another vehicle in each training episode (10 % spread)",
+                "{success_dynamics|%}", "{success_dynamics|range %}", "{collisions_dynamics|%}", "-",
+            ),
             ("PPO", "{success_ppo|%}", "{success_ppo|range %}", "{collisions_ppo|%}", "-"),
         ),
-        ("corridor.png", "corridor_ppo.png"),
+        ("corridor.png", "corridor_dynamics.png", "corridor_ppo.png"),
     ),
     Claim(
         TRAINING,

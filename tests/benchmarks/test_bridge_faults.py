@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.bridge import fuzz
+from benchmarks.bridge import fuzz, with_former
 from benchmarks.bridge_faults import FAULTS, fault_rows, title_of
 
 pytestmark = pytest.mark.quick
@@ -27,3 +27,11 @@ def test_every_fault_that_is_measured_belongs_to_a_row_of_the_table():
 
 def test_no_output_of_any_bits_leaves_the_limits_or_the_slew_limits():
     assert fuzz(300) == (0, 0)
+
+
+def test_of_drives_of_one_kind_all_values_count_and_the_largest_is_the_largest_of_all():
+    shape = {"histogram_from_ms": [0.0, 1.0]}
+    one = ([2.0], "ms", {**shape, "histogram_counts": [1.0, 2.0]})
+    other = ([3.0], "ms", {**shape, "histogram_counts": [4.0, 0.0]})
+    assert with_former("frame_p50_ms", one, other) == ([2.0, 3.0], "ms", {**shape, "histogram_counts": [5.0, 2.0]})
+    assert with_former("frame_max_ms", ([9.0], "ms"), ([3.0], "ms")) == ([9.0], "ms")

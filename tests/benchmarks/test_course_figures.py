@@ -54,6 +54,29 @@ def test_a_run_that_never_reached_99_percent_has_no_time_to_it(tmp_path):
 
 
 @pytest.mark.quick
+def test_a_corridor_trained_with_another_vehicle_in_each_episode_has_figures_of_its_own(tmp_path):
+    driven = {"success": 0.99, "collision": 0.01, "return": 200.0, "episodes": 500}
+    note = {"policy": driven, "env_steps": 2000, "updates": 9, "preset": "paper"}
+    usual = load_run(write_run(tmp_path / "0", [1.0], "paper", "dreamer", CORRIDOR, note))
+    varied = {**driven, "success": 0.97}
+    other = load_run(write_run(tmp_path / "1", [1.0], "paper", "dreamer", CORRIDOR,
+                               {**note, "spread": 0.1, "varied": varied}))
+    assert "success_dynamics" not in next(iter(groups([usual])))[2]
+    [(name, [_], figures)] = groups([other])
+    assert name == "corridor_dynamics"
+    assert figures["success_dynamics"]["value"] == 0.99
+    assert (figures["success_varied_dynamics"]["value"], figures["success_varied_dynamics"]["spread"]) == (0.97, [0.1])
+
+
+@pytest.mark.quick
+def test_a_run_left_beside_others_keeps_the_spread_of_its_vehicles(tmp_path):
+    path = write_run(tmp_path / "0", [1.0], "paper", "dreamer", CORRIDOR)
+    begun = json.loads((path / "run.json").read_text())
+    (path / "run.json").write_text(json.dumps({**begun, "command": {**begun["command"], "spread": 0.1}}))
+    assert load_run(path, "X")["spread"] == 0.1
+
+
+@pytest.mark.quick
 def test_learners_worlds_and_stopped_runs_are_told_apart(tmp_path):
     note = {"policy": {"success": 1.0, "return": 220.0, "episodes": 500}, "env_steps": 2000}
     whole = load_run(write_run(tmp_path / "0", [1.0], note=note))
