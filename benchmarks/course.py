@@ -276,11 +276,10 @@ def parse() -> argparse.Namespace:
     one.add_argument("--change", nargs="+", default=[], metavar="NAME=VALUE", help="other settings of the learner")
     one.add_argument("--ratio", type=in_range(0), help="replayed steps per environment step; the preset's unless given")
     one.add_argument("--repeat", type=whole(), help="control periods that a decision holds; the preset's unless given")
-    one.add_argument("--starts", type=in_range(0, 1), help="share of exploring starts; the preset's unless given")
-    one.add_argument("--second-tries", type=in_range(0, 1),
-                     help="share of failed worlds begun again; the preset's unless given")
-    one.add_argument("--spread", type=in_range(0, 1),
-                     help="of the vehicle's parameters between training episodes; the preset's unless given")
+    for name, of in (("--starts", "share of exploring starts"),
+                     ("--second-tries", "share of failed worlds begun again"),
+                     ("--spread", "of the vehicle's parameters between training episodes")):
+        one.add_argument(name, type=in_range(0, 1), help=f"{of}; the preset's unless given")
     one.add_argument("--episodes", type=whole(), default=1000, help="of the final evaluation and the proofs of sight")
     one.add_argument("--no-planner", dest="planner", action="store_false", help="not beside the policy in the end")
     one.add_argument("--training-only", action="store_true", help="no final evaluation, policy file or proofs of sight")

@@ -45,9 +45,3 @@ def stay_awake(name: str, path: Path = LATENCY) -> None:
         print(f"{name}: {path}: {error.strerror}. The processor may sleep between frames, and each command then comes "
               "up to a millisecond later. Give your group the right to write it (docs/deploy.md); going on without.",
               file=sys.stderr)
-
-
-def leave_realtime() -> None:
-    """Run this thread as a normal process again, where a process that is before all others started it."""
-    if hasattr(os, "sched_setscheduler"):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -53,15 +53,15 @@ def test_a_priority_that_is_none_leaves_the_usual_scheduling(requests, capsys):
     assert "--realtime 100" in capsys.readouterr().err
 
 
-def test_what_a_process_in_real_time_starts_can_leave_it():
+def test_the_trial_of_a_policy_leaves_real_time():
     program = """
 import os, sys
-from bridge import scheduling
+from bridge.policy.trial import leave_realtime
 try:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
 except PermissionError:
     sys.exit(77)
-scheduling.leave_realtime()
+leave_realtime()
 print(os.sched_getscheduler(0) == os.SCHED_OTHER)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
