@@ -243,6 +243,6 @@ def test_policy_without_a_camera_is_paced_by_its_lidar():
 
 def test_an_image_topic_is_refused_where_the_policy_has_no_camera(monkeypatch, capsys):
     lidar = SimpleNamespace(pacer=LIDAR, sensors={"lidar": LIDAR})
-    monkeypatch.setattr("bridge.drive.Policy.load", lambda path: lidar)
+    monkeypatch.setattr("bridge.drive.Policy.load", lambda path, **options: lidar)
     assert main(["walls", "--image-topic", "scanner/scan"]) == Exit.REFUSED
     assert "--image-topic scanner/scan: walls has no camera" in capsys.readouterr().err
