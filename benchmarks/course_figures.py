@@ -28,7 +28,7 @@ def load_run(path: Path, device: str | None = None) -> dict[str, Any]:
         ValueError: there is no note and no device is given; or there was no evaluation.
     """
     metrics = [line for _, line in read_lines(path / "metrics.jsonl")]
-    if (path / "course.json").exists():  # what `benchmarks.course run` left at its end
+    if (path / "course.json").exists():
         noted = json.loads((path / "run.json").read_text())["preset"] if (path / "run.json").exists() else {}
         starts = {"exploring_starts": noted["exploring_starts"]} if "exploring_starts" in noted else {}
         return {**starts, **json.loads((path / "course.json").read_text()), "metrics": metrics}

@@ -40,7 +40,7 @@ class Network:
 
 
 def build(model: bytes, threads: int = 1) -> Any:
-    """Return a session of onnxruntime for a serialised model, of the calling thread and as many more as asked for."""
+    """Return a session of onnxruntime for a serialised model, on so many threads, the calling one among them."""
     import onnxruntime
 
     onnxruntime.set_default_logger_severity(3)

@@ -110,8 +110,8 @@ class Policy:
 
         Args:
             path: folder or zip.
-            threads: on which a step is computed. Two take two thirds of the time, where no other process wants the
-                cores; where one does, the step waits for the slower of both.
+            threads: on which a step is computed. Two take less time where no other process wants the cores; where
+                one does, the step waits for the slower of both.
 
         Raises:
             PolicyFileError: with the file, the field, the value, the rule and the remedy.
