@@ -308,8 +308,7 @@ CLAIMS = (
         TRAINING,
         "Corridor after 200,000 steps",
         "corridor",
-        "New corridors with random paint and light. DreamerV3: 1,000 episodes a seed; PPO: 200. Three seeds each, but "
-        "two with varied vehicles.",
+        "New corridors with random paint and light. DreamerV3: 1,000 episodes a seed; PPO: 200. Three seeds each.",
         ("learner", "success", "range over seeds", "collisions", "training [s]"),
         (
             ("DreamerV3", "{success|%}", "{success|range %}", "{collisions|%}", "{wallclock_s}"),
