@@ -374,6 +374,7 @@ CLAIMS = (
         "The host did other work beside them.",
         ("what", "cold [s]", "warm [s]"),
         (
+            ("first step of a training (obstacle course), one GPU", "{first_step_cold_s}", "{first_step_warm_s}"),
             ("first step of a `WhillEnv`, one GPU", "{env_first_step_cold_s}", "{env_first_step_warm_s}"),
             ("PPO to 99 % of new obstacle courses, one GPU", "{ppo_99_cold_s}", "{ppo_99_warm_s}"),
         ),
