@@ -38,7 +38,7 @@ __all__ = ["TrainingOptions", "TrainResult", "TrainState", "evaluate", "init_sta
 EvalFn = Callable[[Params, int], dict[str, float]]
 StopFn = Callable[[dict[str, float]], bool]
 P = ParamSpec("P")
-COMPILING = "compiling training and evaluation: usually 1 to 2 minutes, seconds where they are kept of an earlier run"
+COMPILING = "compiling training and evaluation: usually 1 to 4 minutes, seconds where they are kept of an earlier run"
 AGREE_EVERY = 16
 """Iterations between the moments at which several processes agree on the clock."""
 
