@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
@@ -266,18 +267,26 @@ def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]], own: Mapping[str, 
 
 
 def of_parameters(cases: Sequence[Case]) -> dict[str, Any]:
-    """Intervals that cover the size driven, and relative errors, where plant and catalogue write an effect alike."""
-    inside, errors = [], []
+    """Intervals that cover the size driven, relative errors, and how wide the intervals are, where plant and catalogue
+    write an effect alike. The ideal intervals are as these, but longer or shorter by one factor, so that they hold 95 %
+    of the sizes."""
+    errors, reach = [], []
     for truth, one in cases:
         for effect in one["effects"]:
             if effect["name"] in truth and effect["name"] in SAME and effect["parameters"]:
                 parameter, neutral, unit = SAME[effect["name"]]
                 driven, seen = neutral + unit * truth[effect["name"]], effect["parameters"][parameter]
-                inside.append(seen["interval"][0] <= driven <= seen["interval"][1])
-                errors.append(abs(seen["value"] - driven) / abs(driven - neutral))
-    if not inside:
+                away = driven - seen["value"]
+                errors.append(abs(away) / abs(driven - neutral))
+                end = seen["interval"][int(away > 0)]
+                reach.append(away / (end - seen["value"]) if end != seen["value"] else math.inf if away else 0.0)
+    if not reach:
         return {}
+    inside = [one <= 1 for one in reach]
+    held = float(np.quantile(reach, 0.95, method="inverted_cdf"))
     return {"interval_coverage": share(inside, f"share of {len(inside)} 95 % intervals"),
+            "interval_width_ratio": figure([1 / held if held > 0 else math.inf],
+                                           f"width over that with which {len(inside)} such intervals hold 95 %"),
             "parameter_error": figure(errors, "of the size")}
 
 

@@ -163,8 +163,8 @@ CLAIMS = (
         CAMERA,
         "What rich looks cost",
         "sight",
-        "Per second, corridor, 16,384 worlds, images of 64x64 RGB. Rich looks have materials with grain and wear, lamps "
-        "with soft shadows, things along the walls and a film model.",
+        "Per second, corridor, 16,384 worlds, images of 64x64 RGB. Rich looks have materials with grain and wear, "
+        "lamps with soft shadows, things along the walls and a film model.",
         ("looks", "images", "images, plain JAX", "control steps with image"),
         (
             ("rich", "{rich_frames_per_s}", "{rich_jnp_frames_per_s}", "{rich_control_steps_per_s}"),

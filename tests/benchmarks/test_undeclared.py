@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from functools import partial
 from typing import get_args, get_type_hints
 
@@ -300,6 +301,23 @@ def test_an_effect_that_the_catalogue_has_by_another_name_is_right_by_that_name(
     found = undeclared_figures.of_singles([("gain_fade", verdict("supply_sag") | warned), ("warm_up", verdict())], "")
     assert found["class_accuracy"]["value"] == 1.0 and found["class_accuracy"]["unit"] == "share of 1 logs"
     assert found["out_of_catalogue"]["unit"].startswith("share of 1 logs")
+
+
+def test_intervals_are_as_wide_as_needed_where_the_worst_of_twenty_just_holds_its_size():
+    def log(driven, low, value, high):
+        seen = {"value": value, "interval": [low, high]}
+        return {"slope": driven}, {"effects": [{"name": "slope", "parameters": {"slope.along_x": seen}}]}
+
+    held = [log(0.10, 0.09, 0.10, 0.11) for _ in range(38)]
+    found = undeclared_figures.of_parameters([*held, log(0.10, 0.08, 0.09, 0.10), log(0.10, 0.08, 0.09, 0.10)])
+    assert found["interval_width_ratio"]["value"] == pytest.approx(math.inf)  # 38 of 40 would be held by a point
+    found = undeclared_figures.of_parameters([*held[:18], *[log(0.10, 0.05, 0.08, 0.14)] * 2])
+    assert found["interval_width_ratio"]["value"] == pytest.approx(3.0)  # a third of the way to the upper end
+    assert found["interval_coverage"]["value"] == 1.0
+    found = undeclared_figures.of_parameters([log(0.10, 0.05, 0.08, 0.09)] * 20)
+    assert found["interval_width_ratio"]["value"] == pytest.approx(0.5)
+    assert found["interval_coverage"]["value"] == 0.0
+    assert not undeclared_figures.of_parameters([({"wind": 1.0}, held[0][1])])
 
 
 @pytest.mark.quick
