@@ -145,7 +145,12 @@ class Mine(Task):
     ("observations(self): return None", "observations: TypeError"),
     ("observations(self): return ['nope']", "observations: ValueError: unknown sensor 'nope'"),
     ("goal(self, scene): return 1.0", "goal: returns .*array .2,."),
-    ("reward(self, moment): return {}", "'reward' is never called; 'rewards' would be"),
+    ("reward(self, moment): return {}", "'reward' is never used; 'rewards' would be"),
+    ("sample_world(self, key): return World(None, jnp.zeros(3))", "scene of its World is NoneType.*must be a Scene"),
+    ("sample_world(self, key): return World(Task().sample_world(key).scene, [0, 0, 0])", "start is list; it must be"),
+    ("endings(self, moment): return {'sucess': moment.reached}", "'sucess' is not counted as 'success'"),
+    ("endings(self, moment): return {'colision': moment.collided}", "'colision' is not counted as 'collision'"),
+    ("rewards(self, moment): return {'a': moment.time_s}\n    per_period = ('tiem',)", "per_period has 'tiem'.* a."),
 ])  # fmt: skip
 def test_a_method_that_cannot_work_is_named_before_anything_is_compiled(method, said, tmp_path):
     path = tmp_path / f"wrong_{abs(hash(method))}.py"
@@ -155,6 +160,32 @@ def test_a_method_that_cannot_work_is_named_before_anything_is_compiled(method, 
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=said):
         make_env(find_task(f"{path}:Mine"))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("body", "said"), [
+    ("max_steps = 50", "its 'max_steps' has no type, so that the default 150 would stay. Write max_steps: int = "),
+    ("max_step: int = 50", "'max_step' is never used; 'max_steps' would be"),
+    ("v_maxx: float = 0.5", "'v_maxx' is never used; 'v_max' would be"),
+    ("look = 'paper'", "'look' is never used; 'looks' would be"),
+    ("budget = {}", "'budget' is never used; 'budgets' would be"),
+])  # fmt: skip
+def test_a_name_that_the_library_would_pass_over_is_refused(body, said, tmp_path):
+    path = tmp_path / f"passed_{abs(hash(body))}.py"
+    path.write_text(f"{HEAD}    {body}\n")
+    with pytest.raises(OptionError, match=said) as caught:
+        named_task(f"{path}:Mine")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.quick
+def test_names_of_ones_own_may_be_like_those_of_the_library_where_something_reads_them(tmp_path):
+    path = tmp_path / "alike.py"
+    path.write_text(f"{HEAD}    max_step: int = 50\n    stop_reward: float = 3.0\n    v_max: float = 0.5\n"
+                    "    def reward(self, moment): return self.max_step * moment.time_s\n"
+                    "    def rewards(self, moment): return {'a': self.reward(moment), 'b': stopped(self, moment)}\n"
+                    "def stopped(task, moment): return task.stop_reward * moment.time_s\n")  # fmt: skip
+    assert named_task(f"{path}:Mine").v_max == 0.5
 
 
 @pytest.mark.quick
@@ -219,6 +250,18 @@ def seen():
     env, params = make_env("corridor")
     state = jax.eval_shape(lambda seed: reset_state(env, params, jax.random.key(seed)), 0)
     return lambda state: view_of(env, params, state), state
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("body", "said"), [
+    ("noise = 0.5", "its 'noise' has no type, so that the default 0.0 would stay"),
+    ("latency = 0.5", "'latency' is never used; 'latency_s' would be"),
+])
+def test_a_field_of_a_sensor_that_would_be_passed_over_is_refused(body, said, seen):
+    found = {"Sensor": Sensor, "Reading": Reading, "dataclass": dataclass, "jnp": jnp, "__name__": "mine"}
+    exec(SENSOR.format(reading=SHAPE, measure=VALUE) + f"    {body}\n", found)
+    with pytest.raises(ValueError, match=f"^sensor 's': {said}"):
+        check_sensor("s", found["Own"](), *seen)
 
 
 @pytest.mark.quick

@@ -19,6 +19,7 @@ import numpy as np
 from flax import struct
 
 from whill_mjx.io.fields import Field, check_fields
+from whill_mjx.io.own_class import check_own_class
 from whill_mjx.tasks.terms import Moment
 
 FIELDS = (
@@ -166,6 +167,7 @@ def check_sensor(name: str, sensor: Sensor, view: Callable[[Any], View], state: 
         view: (state) -> what the sensor may look at.
         state: shapes of a state.
     """
+    check_own_class(f"sensor {name!r}", type(sensor), Sensor)
     try:
         jax.eval_shape(lambda state, seed: _tried(sensor, view(state), jax.random.key(seed)), state, 0)
     except (Exception, SystemExit) as error:

@@ -7,13 +7,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from types import FunctionType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from whill_mjx.io.fields import shown
+from whill_mjx.io.own_class import ALIKE, check_own_class
 from whill_mjx.io.registry import failed
 from whill_mjx.sensors.base import as_sensors
 from whill_mjx.sensors.registry import known_sensors
@@ -21,14 +21,12 @@ from whill_mjx.tasks.base import Budget, Task, World
 from whill_mjx.tasks.terms import Moment
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.world.people.contact import scene_with_people
-from whill_mjx.world.scene import Footprint
+from whill_mjx.world.scene import Footprint, Scene
 
-METHODS = ("sample_world", "populate", "for_vehicle", "goal", "rewards", "endings", "observations")
-"""What a task may define itself."""
+COUNTED = ("success", "collision")
+"""Endings that evaluations report of every task."""
 NAME = re.compile("[A-Za-z][A-Za-z0-9_]{0,63}")
 """Of a task: part of file names, of Gymnasium's ids and of run.json."""
-ALIKE = 0.85
-"""Similarity (`difflib`) from which the name of a method is taken for a misspelling of one of METHODS."""
 
 
 @lru_cache(maxsize=64)
@@ -40,21 +38,27 @@ def check_task(task: Task) -> None:
     """
     if type(task).__module__.startswith("whill_mjx."):
         return
-    _check_names(type(task))
+    check_own_class(f"task {task.name!r}", type(task), Task)
     _check_tables(task)
     world = check_world(task)
     if not isinstance(world, World):
         raise _wrong(task, "sample_world", f"returns {type(world).__name__}", "a World(scene, start)")
-    if jnp.shape(world.start) != (3,):
-        raise _wrong(task, "sample_world", f"start has shape {jnp.shape(world.start)}", "(3,): x, y [m], yaw [rad]")
+    if not isinstance(world.scene, Scene):
+        raise _wrong(task, "sample_world", f"the scene of its World is {_named(world.scene)}", "a Scene")
+    if getattr(world.start, "shape", None) != (3,):
+        shape = getattr(world.start, "shape", None)
+        there = f"is {_named(world.start)}" if shape is None else f"has shape {shape}"
+        raise _wrong(task, "sample_world", f"start {there}", "an array (3,): x, y [m], yaw [rad]")
     if task.people:
         world = _peopled(task, world)
     goal = _traced(task, "goal", world.scene)
     if getattr(goal, "shape", None) != (2,):
         raise _wrong(task, "goal", f"returns {_named(goal)}", "an array (2,): x, y [m]")
     moment = _moment(world)
-    _check_scalars(task, "rewards", moment, "numbers", lambda dtype: not jnp.issubdtype(dtype, jnp.complexfloating))
-    _check_scalars(task, "endings", moment, "flags (True or False)", lambda dtype: jnp.issubdtype(dtype, jnp.bool_))
+    real = lambda dtype: not jnp.issubdtype(dtype, jnp.complexfloating)  # noqa: E731
+    terms = _check_scalars(task, "rewards", moment, "numbers", real)
+    ends = _check_scalars(task, "endings", moment, "flags (True or False)", lambda dtype: jnp.issubdtype(dtype, bool))
+    _check_terms(task, terms, ends)
     _check_observations(task)
 
 
@@ -112,17 +116,20 @@ def check_world(task: Task) -> Any:
     return _traced(task, "sample_world", key)
 
 
-def _check_names(kind: type) -> None:
-    """Refuse a method whose name is nearly one of METHODS: the default would be used without a word."""
-    for name, value in vars(kind).items():
-        if isinstance(value, FunctionType) and name not in METHODS and not name.startswith("_"):
-            meant = difflib.get_close_matches(name, METHODS, 1, ALIKE)
-            if meant and meant[0] not in vars(kind):
-                raise ValueError(f"task {kind.__name__}: its method {name!r} is never called; {meant[0]!r} would be. "
-                                 f"Call it so, or _{name} if it is another.")
+def _check_terms(task: Task, terms: Mapping[str, Any], ends: Mapping[str, Any]) -> None:
+    """Refuse names that mean nothing: of terms that the rewards lack, and misspelt ones of endings that are counted."""
+    if task.per_period is not Task.per_period:
+        for name in set(task.per_period) - set(terms):
+            raise ValueError(f"task {task.name!r}: per_period has {name!r}, which is no reward term (there are: "
+                             f"{', '.join(terms)}). Correct it.")
+    for name in ends:
+        meant = difflib.get_close_matches(name, COUNTED, 1, ALIKE)
+        if meant and meant[0] not in ends:
+            raise ValueError(f"task {task.name!r}: endings: {name!r} is not counted as {meant[0]!r}. Call it so, or by "
+                             "another name.")
 
 
-def _check_scalars(task: Task, method: str, moment: Any, what: str, fits: Any) -> None:
+def _check_scalars(task: Task, method: str, moment: Any, what: str, fits: Any) -> Mapping[str, Any]:
     terms = _traced(task, method, moment)
     if not isinstance(terms, Mapping) or not terms:
         there = "an empty dict" if isinstance(terms, Mapping) else _named(terms)
@@ -132,6 +139,7 @@ def _check_scalars(task: Task, method: str, moment: Any, what: str, fits: Any) -
             raise _wrong(task, method, f"has the name {shown(name)}", "a text")
         if getattr(value, "shape", None) != () or not fits(value.dtype):
             raise _wrong(task, method, f"{name!r} is {_named(value)}", f"one of the {what}, of shape ()")
+    return terms
 
 
 def _traced(task: Task, method: str, argument: Any) -> Any:
