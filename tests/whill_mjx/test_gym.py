@@ -17,7 +17,9 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from whill_mjx.gym import WhillEnv, kinds
 from whill_mjx.gym.kinds import as_actions
 from whill_mjx.gym.vector import WhillVectorEnv
+from whill_mjx.sensors.goal import Goal
 from whill_mjx.tasks.map_goal import MapGoal
+from whill_mjx.tasks.point_goal import PointGoal
 from whill_mjx.tasks.tasks import TASKS, ObstacleCourse
 
 SHORT = ObstacleCourse(max_steps=4)
@@ -271,6 +273,31 @@ def test_a_vector_is_pickled_and_refuses_what_it_cannot_mean():
             WhillVectorEnv(count)
     with pytest.raises(ValueError, match="a pair is a VehicleSpec and its VehicleParams"):
         WhillVectorEnv(2, vehicle=(1, 2))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize(("arguments", "said"), [
+    ({"vehicle": 3}, "^vehicle is 3; it must be a vehicle file, the name of"),
+    ({"vehicle": {"mass": 3}}, "^vehicle is {'mass': 3}; it must be"),
+    ({"vehicle": [1, 2]}, r"^vehicle is \[1, 2\]"),
+    ({"vehicle": (None, None)}, "^vehicle is .NoneType, NoneType.; a pair"),
+    ({"observations": {"a": {"x": 1}}}, "^observation 'a' is {'x': 1}, no sensor"),
+    ({"observations": {1: Goal(), "1": Goal()}}, "a name is there twice"),
+    ({"observations": ("gaol",)}, "^unknown sensor 'gaol'"),
+    ({"layout": ["fixed"]}, "layout is"), ({"task": PointGoal}, "^task is <class .*give a Task such as"),
+])  # fmt: skip
+def test_arguments_of_a_wrong_kind_are_refused_in_one_line(arguments, said):
+    for kind in (WhillEnv, lambda **given: WhillVectorEnv(2, **given)):
+        with pytest.raises(ValueError, match=said) as caught:
+            kind(**({"task": "point_goal"} | arguments))
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.quick
+def test_names_of_observations_may_be_of_several_types_and_modes_of_no_kind_are_refused():
+    assert set(WhillEnv("point_goal", observations={1: Goal(), "a": Goal()}).observation_space) == {"1", "a"}
+    with pytest.raises(ValueError, match="autoreset_mode is 'same_step'; use one of .*'SameStep'"):
+        WhillVectorEnv(2, task="point_goal", autoreset_mode="same_step")
 
 
 @pytest.mark.quick

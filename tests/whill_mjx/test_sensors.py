@@ -30,6 +30,7 @@ from whill_mjx.sensors.odometry import Odometry
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.point_goal import PointGoal
 from whill_mjx.tasks.tasks import scale_action
+from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.world.scene import box, stack_boxes
 
 
@@ -166,6 +167,44 @@ def test_wrong_numbers_of_a_sensor_are_refused():
     for wrong in ({"rate_hz": 0.0}, {"latency_s": -1.0}, {"dropout": 1.5}, {"noise": float("nan")}):
         with pytest.raises(ValueError, match=f"sensor Goal: {next(iter(wrong))} is"):
             Goal(**wrong)
+
+
+@pytest.mark.quick
+def test_what_all_sensors_share_is_given_by_its_name_alone():
+    for kind in known_sensors().values():
+        shared = {one.name: one.kw_only for one in dataclasses.fields(kind)
+                  if one.name in ("rate_hz", "latency_s", "jitter_s", "dropout", "noise")}
+        assert len(shared) == 5 and all(shared.values()), kind
+    assert Lidar(36).rays == 36
+
+
+@pytest.mark.quick
+def test_little_noise_flips_no_flag():
+    kind = type("Flag", (Clock,), {
+        "reading": lambda self, env: Reading((64,), 0, 1, bool),
+        "measure": lambda self, memory, view, key: (memory, jnp.arange(64) % 2 == 1),
+    })  # fmt: skip
+    env, params = make_env("point_goal", observations={"flags": kind(noise=0.01)})
+    _, first = jax.jit(lambda key: reset(env, params, key))(jax.random.key(0))
+    np.testing.assert_array_equal(first.obs["flags"], np.arange(64) % 2 == 1)
+
+
+@pytest.mark.quick
+def test_a_mount_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="sensor Camera: mount: is {'x': 1}; it must be a CameraMount"):
+        Camera(mount={"x": 1})
+    with pytest.raises(ValueError, match="camera of vehicle 'mine': is .*; it must be a CameraMount"):
+        VehicleSpec("mine", 0.1, 0.5, 0.6, 50.0, camera={"x": 1})
+
+
+@pytest.mark.quick
+def test_a_sensor_with_an_array_in_it_is_refused_by_name():
+    @dataclasses.dataclass(frozen=True)
+    class Bearings(Clock):
+        angles: Any = ()
+
+    with pytest.raises(ValueError, match="observation 'b', Bearings: unhashable.*Give a tuple"):
+        make_env("point_goal", observations={"b": Bearings(angles=np.zeros(2))})
 
 
 @pytest.mark.quick

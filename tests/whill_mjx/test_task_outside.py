@@ -373,6 +373,8 @@ def test_wrong_tasks_and_fields_are_refused():
     class Misspelt(Corridor):
         budgets: ClassVar = {"cpu": Budget(100, learner={"learning_rate": 1.0})}
 
+    with pytest.raises(ValueError, match="task 'slalom': unhashable.*Give a tuple for an array"):
+        make_env(Slalom(poles=np.ones(2)))
     with pytest.raises(ValueError, match="there is no 'learning_rate' to change"):
         find_preset("cpu", Misspelt())
     with pytest.raises(OptionError, match="no field 'wdith'"):

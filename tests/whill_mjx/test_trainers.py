@@ -109,3 +109,9 @@ def test_the_environments_of_other_trainers_need_none_of_their_packages():
     code = "import whill_mjx.gym.brax, whill_mjx.gym.rsl_rl, whill_mjx.gym.sb3, sys; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.strip() == "False", done.stderr
+
+
+@pytest.mark.quick
+def test_the_class_of_a_task_is_no_task():
+    with pytest.raises(ValueError, match="^task is <class .*give a Task such as"):
+        BraxEnv(PointGoal)

@@ -12,9 +12,10 @@ import jax
 from whill_mjx.env.episode import reset
 from whill_mjx.env.moments import view_of
 from whill_mjx.env.records import Env
+from whill_mjx.io.fields import shown
 from whill_mjx.sensors.base import Sensor, as_sensors, check_sensor
 from whill_mjx.sensors.registry import known_sensors
-from whill_mjx.tasks.check import check_task, fitted_task
+from whill_mjx.tasks.check import check_is_task, check_task, fitted_task
 from whill_mjx.tasks.tasks import Task, make_task
 from whill_mjx.vehicle.model import build_model
 from whill_mjx.vehicle.presets import preset_params
@@ -64,8 +65,7 @@ def make_env(
             else than it must; a share that is none; rich looks of a task without a lane.
     """
     task = make_task(task) if isinstance(task, str) else task
-    if not isinstance(task, Task):
-        raise ValueError(f"task is {task!r}; give a Task such as Corridor(), or the name of one.")
+    check_is_task(task)
     if layout is not None:
         task = dataclasses.replace(task, layout=layout)
     spec, params = as_vehicle(vehicle)
@@ -134,7 +134,11 @@ def as_vehicle(
         return vehicle, preset_params(vehicle, "physical")
     if isinstance(vehicle, tuple):
         if [type(one) for one in vehicle] != [VehicleSpec, VehicleParams]:
-            raise ValueError(f"vehicle is {vehicle!r}; a pair is a VehicleSpec and its VehicleParams. Give both.")
+            there = ", ".join(type(one).__name__ for one in vehicle)
+            raise ValueError(f"vehicle is ({there}); a pair is a VehicleSpec and its VehicleParams. Give both.")
         return vehicle
+    if not isinstance(vehicle, str | Path | None):
+        raise ValueError(f"vehicle is {shown(vehicle)}; it must be a vehicle file, the name of a built-in vehicle, a "
+                         "VehicleSpec, or a spec with its parameters. Give one of them.")
     spec, params, _ = load_vehicle(DEFAULT_VEHICLE if vehicle is None else vehicle)
     return spec, params

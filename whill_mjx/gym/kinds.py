@@ -25,7 +25,9 @@ from whill_mjx.env import EVENT_METRICS, POSE_METRICS, make_env, observe
 from whill_mjx.evaluation.conditions import NAMES, Condition, arranged, begin_under, nominal
 from whill_mjx.io.fields import CONDITION, check, shown
 from whill_mjx.io.garbage import undisturbed
-from whill_mjx.vehicle.types import TimeStep
+from whill_mjx.sensors.base import as_sensors
+from whill_mjx.sensors.registry import known_sensors
+from whill_mjx.vehicle.types import TimeStep, VehicleParams
 
 OPTIONS = tuple(name for name in NAMES if name != "latency" and not name.startswith("camera_"))
 """What `reset(options=...)` may change of an episode; docs/evaluate.md says what each means."""
@@ -225,15 +227,21 @@ def _key_of(arguments: Mapping[str, Any]) -> Any:
         value = arguments[name]
         if name == "vehicle" and isinstance(value, str | os.PathLike) and os.path.isfile(value):
             value = (os.path.abspath(value), os.stat(value).st_mtime_ns)
-        if isinstance(value, Mapping):
-            value = tuple(sorted(value.items()))
-        elif isinstance(value, list):
-            value = tuple(value)
-        elif isinstance(value, tuple) and name == "vehicle" and len(value) == 2 and not isinstance(value[0], str):
+        if name == "observations" and value is not None:
+            value = as_sensors(value, known_sensors())
+        elif isinstance(value, tuple) and len(value) == 2 and isinstance(value[1], VehicleParams):
             leaves, tree = jax.tree.flatten(value[1])
             value = (value[0], tree, tuple(float(leaf) for leaf in leaves))
-        values.append((name, value))
+        values.append((name, value if _hashes(value) else repr(value)))  # `make_env` says what is wrong with it
     return tuple(values)
+
+
+def _hashes(value: Any) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
 
 
 def space_of(env: Any) -> gymnasium.Space:

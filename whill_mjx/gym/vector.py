@@ -58,6 +58,9 @@ class WhillVectorEnv(Carried, gymnasium.vector.VectorEnv):
             ValueError: of `WhillEnv`; a number of instances below 1; an unknown mode.
         """
         self.num_envs = check("WhillVectorEnv", BATCH[0], num_envs, "num_envs")
+        modes = [one.value for one in AutoresetMode]
+        if autoreset_mode not in (*AutoresetMode, *modes):
+            raise ValueError(f"autoreset_mode is {shown(autoreset_mode)}; use one of {modes}.")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])

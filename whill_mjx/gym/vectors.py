@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from whill_mjx.env import Env, make_env
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.sensors.privileged import Privileged
+from whill_mjx.tasks.check import check_is_task
 from whill_mjx.tasks.tasks import Task, make_task
 from whill_mjx.vehicle.types import VehicleParams
 
@@ -28,6 +29,7 @@ def make_endless(
         ValueError: of `make_env`; an observation that is no vector.
     """
     task = make_task(task) if isinstance(task, str) else task
+    check_is_task(task)
     steps = -(-task.max_steps // task.action_repeat)
     env, params = make_env(dataclasses.replace(task, max_steps=ENDLESS), vehicle=vehicle, observations=observations)
     images = [name for name, sensor in env.sensors if len(sensor.reading(env).shape) != 1]

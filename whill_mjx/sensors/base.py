@@ -206,7 +206,7 @@ def _finished(sensor: Sensor, reading: Reading, value: jax.Array, key: jax.Array
     if not sensor.noise or sensor.noisy:
         return _bounded(value, reading) if _of_a_user(sensor) else value.astype(reading.dtype)
     value = value.astype(jnp.float32) + sensor.noise * jax.random.normal(key, value.shape)
-    if np.issubdtype(reading.dtype, np.integer):
+    if np.dtype(reading.dtype).kind in "biu":
         value = jnp.round(value)
     return _bounded(value, reading)
 
@@ -283,7 +283,7 @@ def as_sensors(observations: Any, known: Mapping[str, type[Sensor]]) -> Sensors:
     """Sensors by name from a mapping of names to sensors, or from names of this package's sensors.
 
     Raises:
-        ValueError: an unknown name, no sensor, or a name twice.
+        ValueError: an unknown name, no sensor, a sensor with a list or an array in it, or a name twice.
     """
     if isinstance(observations, str):
         observations = (observations,)
@@ -298,7 +298,11 @@ def as_sensors(observations: Any, known: Mapping[str, type[Sensor]]) -> Sensors:
         if isinstance(sensor, type) or not dataclasses.is_dataclass(sensor) or not isinstance(sensor, Sensor):
             raise ValueError(f"observation {name!r} is {sensor!r}, no sensor. Give an instance of a frozen dataclass "
                              "that derives from whill_mjx.sensors.base.Sensor.")
-        hash(sensor)
+        try:
+            hash(sensor)
+        except TypeError as error:
+            raise ValueError(f"observation {name!r}, {type(sensor).__name__}: {error}; its fields must be numbers, "
+                             "texts or tuples of them. Give a tuple for an array or a list.") from error
         found.append((str(name), sensor))
     if len({name for name, _ in found}) < len(found):
         raise ValueError(f"observations {[name for name, _ in found]}: a name is there twice. Rename one.")

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 
 from whill_mjx.env import observe
-from whill_mjx.io.fields import CAMERA, Field, check_fields
+from whill_mjx.io.fields import Field
 from whill_mjx.sensors.base import ALONG, IMAGE, Reading, Sensor, View
-from whill_mjx.vehicle.specs import CameraMount
+from whill_mjx.vehicle.specs import CameraMount, check_mount
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Camera(Sensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.mount is not None:
-            check_fields("sensor Camera: mount", CAMERA, self.mount)
+            check_mount("sensor Camera: mount", self.mount)
 
     def size(self, env: Any) -> tuple[int, int]:
         """Rows and columns."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import jax
@@ -52,7 +52,7 @@ class Lidar3D(Sensor):
     """Above it, along the chassis [m]."""
     nearest: float = 0.0
     """Shorter distances give no return [m]."""
-    noise: float = 0.0
+    noise: float = field(default=0.0, kw_only=True)
     """Standard deviation of a distance [m]."""
     dropouts: float = 0.0
     """Share of rays that give no return by chance."""

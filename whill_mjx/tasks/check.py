@@ -62,6 +62,17 @@ def check_task(task: Task) -> None:
     _check_observations(task)
 
 
+def check_is_task(task: Any) -> None:
+    """Raise ValueError for anything else than a task, such as its class, and for one with a list or array in it."""
+    if not isinstance(task, Task):
+        raise ValueError(f"task is {task!r}; give a Task such as Corridor(), or the name of one.")
+    try:
+        hash(task)
+    except TypeError as error:
+        raise ValueError(f"task {task.name!r}: {error}; its fields must be numbers, texts or tuples of them. Give a "
+                         "tuple for an array or a list.") from error
+
+
 def fitted_task(task: Task, spec: VehicleSpec) -> Task:
     """The task as a vehicle needs it; ValueError where its method fails or returns something else."""
     try:

@@ -8,6 +8,7 @@ at x = -0.265 m would lie behind that axle and tip the chair.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from whill_mjx.io import fields
 
@@ -33,6 +34,14 @@ class CameraMount:
     """Clockwise turn about the line of sight, seen from behind the camera [rad]."""
     yaw: float = 0.0
     """Turn of the line of sight to the left [rad]."""
+
+
+def check_mount(where: str, mount: Any) -> None:
+    """Raise ValueError unless it is a mount with sensible numbers."""
+    if not isinstance(mount, CameraMount):
+        raise ValueError(f"{where}: is {fields.shown(mount)}; it must be a CameraMount. Give one, such as "
+                         "CameraMount(x=0.3, z=0.5).")
+    fields.check_fields(where, fields.CAMERA, mount)
 
 
 @dataclass(frozen=True)
@@ -74,7 +83,7 @@ class VehicleSpec:
 
     def __post_init__(self) -> None:
         fields.check_fields(f"vehicle {fields.shown(self.name)}", fields.SPEC, self)
-        fields.check_fields(f"camera of vehicle {fields.shown(self.name)}", fields.CAMERA, self.camera)
+        check_mount(f"camera of vehicle {fields.shown(self.name)}", self.camera)
 
     @property
     def rear_x(self) -> float:
