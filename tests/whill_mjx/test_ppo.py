@@ -12,6 +12,8 @@ import pytest
 from half_lit import TINY, half_lit_env
 
 from dreamer.train import TrainingOptions
+from whill_mjx.batch import make_batch
+from whill_mjx.env import make_env
 from whill_mjx.learning.ppo import (
     Network,
     PpoConfig,
@@ -27,6 +29,9 @@ from whill_mjx.learning.ppo import (
     track,
 )
 from whill_mjx.learning.ppo_training import Length, train_ppo
+from whill_mjx.learning.setup import check_learner, find_preset
+from whill_mjx.sensors.camera import Camera
+from whill_mjx.sensors.goal import Goal
 
 QUIET = TrainingOptions(progress=False)
 
@@ -269,6 +274,19 @@ def test_the_exported_network_of_several_readings_drives_through_the_bridge_like
 def test_scans_of_several_lengths_are_refused():
     with pytest.raises(ValueError, match="one length"):
         empty_frames(SENSING, {"front": (16,), "rear": (20,)}, (1,))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("learner", ["dreamer", "ppo"])
+@pytest.mark.parametrize(("sensors", "said"), [
+    ({"front": Camera(8, 16), "rear": Camera(16, 8)}, "all images must have one height and width"),
+    ({"action": Goal()}, "observation 'action': the exported policy has another tensor of this name"),
+])  # fmt: skip
+def test_observations_that_could_not_be_learned_or_exported_are_refused_before_the_training(learner, sensors, said):
+    preset = find_preset("smoke", "point_goal")
+    env, params = make_env(preset.task, observations=sensors)
+    with pytest.raises(ValueError, match=said):
+        check_learner(preset, learner, make_batch(env, params, preset.instances))
 
 
 @pytest.mark.quick

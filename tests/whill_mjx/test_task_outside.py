@@ -215,6 +215,13 @@ def test_a_budget_of_no_preset_or_of_no_kind_is_refused(budgets):
         find_preset("smoke", dataclass(frozen=True)(kind)())
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("name", ["fields", "learner", "ppo"])
+def test_settings_of_a_budget_that_are_no_dict_are_refused(name):
+    with pytest.raises(ValueError, match=f"budget: {name} is 3; it must be a dict"):
+        Budget(100, **{name: 3})
+
+
 SENSOR = """
 @dataclass(frozen=True)
 class Own(Sensor):

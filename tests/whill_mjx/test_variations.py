@@ -38,6 +38,14 @@ def test_fit_stands_for_the_intervals_of_the_vehicle_file(tmp_path):
         variations_of(["fit"], "whill_cr")
 
 
+@pytest.mark.parametrize("interval", [(-45.0, 60.0), (-np.inf, np.inf)])
+def test_an_interval_of_a_file_that_no_vehicle_can_have_is_refused(tmp_path, interval):
+    spec, params = preset("whill_cr")
+    path = save_vehicle(tmp_path / "vehicle.toml", spec, params, {"body.mass": interval})
+    with pytest.raises(ValueError, match=r"vehicle.toml: body.mass.interval: body.mass is -.*; it must be positive"):
+        variations_of(["fit"], path)
+
+
 @pytest.mark.parametrize(("text", "said"), [
     ("body.mass", "is no variation"), ("body.mass=1:0", "is no variation"), ("body.mass=0.9x:2", "is no variation"),
     ("body.mass=a:b", "is no variation"), ("body.mass=0:inf", "is no variation"),

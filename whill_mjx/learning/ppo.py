@@ -254,8 +254,9 @@ def init_state(env: Any, config: PpoConfig, seed: int | jax.Array) -> PpoState:
 
 
 def check_fit(env: Any, config: PpoConfig) -> None:
-    """Raise ValueError where the minibatches do not divide a rollout, or scans have several lengths."""
+    """Raise ValueError where the minibatches do not divide a rollout, or scans or images have several sizes."""
     instances = env.num_envs
+    spaces.image_shape(env.obs_shape)
     if isinstance(env.obs_shape, Mapping):
         rays_of(config, env.obs_shape)
     if instances * config.rollout % config.minibatches:

@@ -32,7 +32,7 @@ from whill_mjx.tasks.tasks import Budget, Task, make_task
 from whill_mjx.vehicle.types import TimeStep
 from whill_mjx.vehicle.vehicle_file import load_intervals
 from whill_mjx.world.people.crowd import People
-from whill_mjx.world.randomize import Variation, read_variation
+from whill_mjx.world.randomize import Variation, check_parameter, read_variation
 
 PAINTS = 15
 """Worlds of other looks that the mirror shows at most; any number could be drawn, but each takes memory."""
@@ -409,6 +409,11 @@ def check_learner(preset: Preset, learner: str, batch: BatchEnv) -> None:
         check_fit(env, preset.learner)
     else:
         ppo.check_fit(env, preset.ppo)
+    _, carry = (dreamer_policy if learner == "dreamer" else ppo_policy)(preset, batch.env)
+    taken = {"action", *(f"{way}_{name}" for name in carry for way in ("carry", "next"))}
+    for name in taken & {name for name, _ in batch.env.sensors}:
+        raise ValueError(f"observation {name!r}: the exported policy has another tensor of this name, and ONNX wants "
+                         "each once. Rename the observation.")
 
 
 def make_training_env(preset: Preset, vehicle: str | Path | None, devices: tuple = ()) -> BatchEnv:
@@ -430,7 +435,7 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
     """What is drawn in each episode: NAME=LOW:HIGH of one parameter, or "fit" for all intervals of the vehicle file.
 
     Raises:
-        ValueError: a text that is neither, or a vehicle without intervals.
+        ValueError: a text that is neither, a vehicle without intervals, or an interval beyond what a parameter may be.
     """
     found: list[Variation] = []
     for text in texts:
@@ -441,7 +446,9 @@ def variations_of(texts: Sequence[str], vehicle: str | Path | None) -> tuple[Var
         if not intervals:
             raise ValueError(f"vary 'fit': {vehicle} has no intervals. Give a file that sysid.fit wrote, or ranges "
                              "such as body.mass=0.9x:1.1x.")
-        found += [Variation(name, low, high) for name, (low, high) in intervals.items()]
+        for name, (low, high) in intervals.items():
+            check_parameter(f"{vehicle}: {name}.interval", name, (low, high), relative=False)
+            found.append(Variation(name, low, high))
     names = [text.partition("=")[0] for text in texts]
     for name in names:
         if names.count(name) > 1:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from whill_mjx.io.fields import BUDGET, TASK, Field, check_fields
+from whill_mjx.io.fields import BUDGET, TASK, Field, check_fields, shown
 from whill_mjx.tasks import terms
 from whill_mjx.tasks.parts import Draws, make_marker, room
 from whill_mjx.tasks.terms import Moment
@@ -70,6 +70,10 @@ class Budget:
 
     def __post_init__(self) -> None:
         check_fields("budget", BUDGET, self)
+        for name in ("fields", "learner", "ppo"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise ValueError(f"budget: {name} is {shown(getattr(self, name))}; it must be a dict of settings by "
+                                 "name. Correct it.")
 
 
 @dataclass(frozen=True)
