@@ -28,7 +28,7 @@ import tyro
 
 from whill_mjx.env import make_env
 from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, random_driver
-from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, summarise
+from whill_mjx.evaluation.episodes import NEAR_M, Course, Episodes, episode_keys, other_endings, summarise
 from whill_mjx.evaluation.policy_file import PolicyFile, load_policy
 from whill_mjx.evaluation.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, run_sweep
@@ -282,9 +282,10 @@ def headline(name: str, summary: dict[str, Any]) -> str:
     """One line of the figures that matter most."""
     low, high = summary["success_interval_95"]
     seconds = summary["time_to_goal_s"]
+    others = "".join(f"{ending} {share:.1%}  " for ending, share in other_endings(summary).items())
     return (
         f"{name:18s} success {summary['success']:6.1%} [{low:.1%}, {high:.1%}]  collision {summary['collision']:5.1%}  "
-        f"time-out {summary['timeout']:5.1%}  return {summary['return']:.1f}  "
+        f"time-out {summary['timeout']:5.1%}  {others}return {summary['return']:.1f}  "
         f"to the goal {'-' if seconds is None else f'{seconds:.2f} s'}  near misses {summary['near_misses']:.2f}"
     )
 

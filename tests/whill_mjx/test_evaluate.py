@@ -16,7 +16,7 @@ import pytest
 
 from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
-from whill_mjx.evaluate import EvaluateOptions, choose_task, draw, main
+from whill_mjx.evaluate import EvaluateOptions, choose_task, draw, headline, main
 from whill_mjx.evaluation import pages
 from whill_mjx.evaluation.conditions import nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
@@ -287,6 +287,9 @@ def test_an_ending_of_the_tasks_own_is_shown_by_its_name():
     assert [pages.ending(episodes, index) for index in range(2)] == ["lost_sight", "success"]
     table = pages._figures({"policy": summarise(episodes)})
     assert re.search(r"lost sight.{0,40}50\W*%", table)
+    assert "time-out  0.0%  lost_sight 50.0%  return" in headline("policy", summarise(episodes))
+    broken = made_up([[1.0] * 3] * 2, [("diverged", 0.2), ("success", 0.1)])
+    assert "time-out  0.0%  diverged 50.0%  return" in headline("policy", summarise(broken))
 
 
 def test_an_evaluation_replaces_page_pictures_and_video_of_an_earlier_one(tmp_path):

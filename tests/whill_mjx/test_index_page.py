@@ -46,6 +46,13 @@ def test_a_share_is_not_rounded_to_all_or_none_of_the_episodes(tmp_path):
     assert shown == ["0%", "under 0.1%", "25%", "over 99.9%", "100%"]
 
 
+def test_endings_of_the_tasks_own_and_divergence_are_shown(tmp_path):
+    ends = {name: value for one, share in (("diverged", 0.5), ("astray", 0.25), ("parked", 0.0))
+            for name, value in ((one, share), (f"{one}_interval_95", [0.0, 1.0]))}  # fmt: skip
+    text = write_index(tmp_path, {"env_steps": 400, "policy": FIGURES | ends}, "obstacle_course").read_text()
+    assert "diverged 50%, astray 25%<" in text
+
+
 def test_the_next_command_can_be_copied_where_the_folder_has_a_space(tmp_path):
     out = tmp_path / "my runs" / "first"
     (out / "policy").mkdir(parents=True)

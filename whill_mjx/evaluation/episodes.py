@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -182,6 +182,13 @@ class Course:
 def shares_of(episodes: Episodes) -> tuple[str, ...]:
     """Names of all endings: SHARES, and those that the task adds."""
     return (*SHARES, *sorted(set(episodes.ends) - {*SHARES, "time_s", "episode_return"}))
+
+
+def other_endings(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Shares above 0 of the endings of a summary that are no success, collision or time-out, by name."""
+    figures = {*SHARES[:3], *MEANS, *OF_SUCCESSES}
+    names = [name for name in summary if name not in figures and f"{name}_interval_95" in summary]
+    return {name: summary[name] for name in names if summary[name]}
 
 
 def episode_figures(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, np.ndarray]:

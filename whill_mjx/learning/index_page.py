@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from whill_mjx.evaluation.episodes import other_endings
 from whill_mjx.io import html
 from whill_mjx.io.fields import in_shell, percent
 from whill_mjx.io.folders import write_whole
@@ -73,10 +74,12 @@ def _result(out: Path, evaluation: dict[str, Any]) -> str:
         one = evaluation[name]
         low, high = one["success_interval_95"]
         seconds = one["time_to_goal_s"]
+        others = ", ".join(f"{ending} {percent(share)}" for ending, share in other_endings(one).items())
         rows.append([DRIVERS[name], percent(one["success"]), f"{percent(low)} to {percent(high)}",
-                     percent(one["collision"]), percent(one["timeout"]),
+                     percent(one["collision"]), percent(one["timeout"]), others or "–",
                      "–" if seconds is None else f"{seconds:.1f} s", one["return"]])
-    header = ["driver", "success", "95% interval", "collision", "time-out", "time to the goal", "return"]
+    header = ["driver", "success", "95% interval", "collision", "time-out", "other endings", "time to the goal",
+              "return"]
     command = f"python -m whill_mjx.evaluate {in_shell(out / 'policy')} --html"
     return html.table(header, rows) + html.paragraph(f"More episodes, proofs of sight and sweeps: {command}", "dim")
 
