@@ -235,6 +235,8 @@ def test_the_wheels_of_a_skid_drive_of_a_short_file_turn_as_commanded(tmp_path):
     (SHORT + "[body.mass]\nvalue = 1.0\nunit = 'kg'\n", "has body; it must have both body and effects"),
     (SHORT.replace("[spec]", 'base = "wooden"\n[spec]'), "base is 'wooden'; it must be one of 'paper', 'physical'"),
     (SHORT.replace("yaw = 0.5", "yaw = 50"), r"spec.camera.yaw is 50"),
+    (SHORT.replace("[spec.camera]", "rear_axle_x = 5.0\n[spec.camera]"), "axle 5.* m from the middle of the body"),
+    (SHORT.replace("track = 0.16", "track = 0.5"), "spec.track is 0.5 m and spec.body_width"),
 ])  # fmt: skip
 def test_a_short_file_with_a_mistake_is_one_line(text, said, tmp_path):
     path = tmp_path / "burger.toml"

@@ -116,6 +116,7 @@ def read_vehicle(path: str | Path) -> tuple[VehicleSpec, VehicleParams, dict[str
     content = _read(path)
     spec = _read_spec(path, content["spec"])
     if "body" not in content and "effects" not in content:
+        _check_sizes(path, spec)
         return spec, in_short(spec, content.get("base", "physical")), content.get("provenance", {})
     sizes = spec.mass, spec.wheel_radius
     body = _read_parameters(path, "body", Body, content["body"], sizes)
@@ -202,6 +203,18 @@ def _read_spec(path: Path, table: dict[str, Any]) -> VehicleSpec:
         return VehicleSpec(**(known | checked), camera=dataclasses.replace(usual.camera, **camera))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _check_sizes(path: Path, spec: VehicleSpec) -> None:
+    """Refuse a body that does not reach to its wheels."""
+    farthest = max(abs(spec.rear_x), abs(spec.front_x))
+    if farthest > spec.body_length / 2 + spec.wheel_radius:
+        raise ValueError(f"{path}: spec.wheelbase {spec.wheelbase:g} m and the rear axle at {spec.rear_x:g} m put an "
+                         f"axle {farthest:g} m from the middle of the body, which is {spec.body_length:g} m long. "
+                         "Correct wheelbase, rear_axle_x or body_length.")
+    if spec.track > spec.body_width:
+        raise ValueError(f"{path}: spec.track is {spec.track:g} m and spec.body_width {spec.body_width:g} m; the body "
+                         "is as wide as its wheels at least. Correct one.")
 
 
 def _effect_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
