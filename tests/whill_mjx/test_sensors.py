@@ -155,7 +155,7 @@ def test_every_sensor_of_the_package_is_found_by_its_file():
 @pytest.mark.quick
 @pytest.mark.parametrize(("observations", "said"), [
     (("sonar",), "unknown sensor 'sonar' .known: .*lidar"), ({"a": 3}, "no sensor"), ({"a": Lidar}, "no sensor"),
-    (("lidar", "lidar"), "twice"),
+    (("lidar", "lidar"), "twice"), ({"": Lidar()}, "observation '', Lidar: has an empty name"),
 ])  # fmt: skip
 def test_what_is_no_sensor_is_refused(observations, said):
     with pytest.raises(ValueError, match=said):

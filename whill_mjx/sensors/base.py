@@ -303,6 +303,8 @@ def as_sensors(observations: Any, known: Mapping[str, type[Sensor]]) -> Sensors:
         except TypeError as error:
             raise ValueError(f"observation {name!r}, {type(sensor).__name__}: {error}; its fields must be numbers, "
                              "texts or tuples of them. Give a tuple for an array or a list.") from error
+        if not str(name):
+            raise ValueError(f"observation {name!r}, {type(sensor).__name__}: has an empty name. Give it one.")
         found.append((str(name), sensor))
     if len({name for name, _ in found}) < len(found):
         raise ValueError(f"observations {[name for name, _ in found]}: a name is there twice. Rename one.")
