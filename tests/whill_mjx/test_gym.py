@@ -294,6 +294,17 @@ def test_arguments_of_a_wrong_kind_are_refused_in_one_line(arguments, said):
 
 
 @pytest.mark.quick
+def test_an_edited_file_of_a_task_is_read_anew_in_the_same_process(tmp_path):
+    path = tmp_path / "edited.py"
+    text = ("from dataclasses import dataclass\nfrom whill_mjx import Task\n\n"
+            "@dataclass(frozen=True)\nclass Mine(Task):\n    max_steps: int = ")
+    for steps in (60, 30):
+        path.write_text(f"{text}{steps}\n")
+        assert WhillEnv(f"{path}:Mine").env.task.max_steps == steps
+    assert type(WhillEnv(f"{path}:Mine").env.task) is type(WhillEnv(f"{path}:Mine").env.task)
+
+
+@pytest.mark.quick
 def test_names_of_observations_may_be_of_several_types_and_modes_of_no_kind_are_refused():
     assert set(WhillEnv("point_goal", observations={1: Goal(), "a": Goal()}).observation_space) == {"1", "a"}
     with pytest.raises(ValueError, match="autoreset_mode is 'same_step'; use one of .*'SameStep'"):

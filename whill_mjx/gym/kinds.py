@@ -27,6 +27,7 @@ from whill_mjx.io.fields import CONDITION, check, shown
 from whill_mjx.io.garbage import undisturbed
 from whill_mjx.sensors.base import as_sensors
 from whill_mjx.sensors.registry import known_sensors
+from whill_mjx.tasks.tasks import find_task
 from whill_mjx.vehicle.types import TimeStep, VehicleParams
 
 OPTIONS = tuple(name for name in NAMES if name != "latency" and not name.startswith("camera_"))
@@ -221,13 +222,15 @@ def _static(env: Any, params: Any, spread: float) -> Any:
 
 
 def _key_of(arguments: Mapping[str, Any]) -> Any:
-    """Arguments as they were given; a vehicle file counts by its content."""
+    """Arguments as they were given; files of a vehicle or a task count by their content."""
     values = []
     for name in sorted(arguments):
         value = arguments[name]
         if name == "vehicle" and isinstance(value, str | os.PathLike) and os.path.isfile(value):
             value = (os.path.abspath(value), os.stat(value).st_mtime_ns)
-        if name == "observations" and value is not None:
+        if name == "task" and isinstance(value, str):
+            value = find_task(value)  # its file may have been edited
+        elif name == "observations" and value is not None:
             value = as_sensors(value, known_sensors())
         elif isinstance(value, tuple) and len(value) == 2 and isinstance(value[1], VehicleParams):
             leaves, tree = jax.tree.flatten(value[1])

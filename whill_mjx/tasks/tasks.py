@@ -154,7 +154,8 @@ def _import(name: str, place: str) -> ModuleType:
         path = Path(place).resolve()
         if not path.is_file():
             raise ValueError(f"task {name!r}: no such file {place}. Correct the path.")
-        alias = f"task_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+        version = hashlib.sha256(str(path).encode() + path.read_bytes())  # one that is edited is read anew
+        alias = f"task_{path.stem}_{version.hexdigest()[:8]}"
         if alias not in sys.modules:
             spec = importlib.util.spec_from_file_location(alias, path)
             assert spec is not None and spec.loader is not None
