@@ -375,6 +375,8 @@ def test_wrong_tasks_and_fields_are_refused():
         register_task(Loose)
     with pytest.raises(TypeError, match="no task"):
         register_task("corridor")
+    with pytest.raises(ValueError, match="'point_Goal' would have the id of Gymnasium that 'point_goal' has"):
+        register_task(dataclass(frozen=True)(type("Other", (Corridor,), {"name": "point_Goal"})))
 
     @dataclass(frozen=True)
     class Misspelt(Corridor):

@@ -18,7 +18,7 @@ import numpy as np
 
 from whill_mjx.gym.kinds import Carried, Kind, as_actions, check_process, condition_of, find_kind, info_names
 from whill_mjx.sensors.base import Sensor
-from whill_mjx.tasks.tasks import TASKS, Task
+from whill_mjx.tasks.tasks import TASKS, Task, in_camel
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.types import VehicleParams
 
@@ -178,7 +178,7 @@ def close_window() -> None:
 
 def env_id(task: Task) -> str:
     """Gymnasium's id of a task: WhillObstacleCourse-v0 of obstacle_course."""
-    return f"Whill{''.join(part.capitalize() for part in task.name.split('_'))}-v0"
+    return f"Whill{in_camel(task.name)}-v0"
 
 
 def register_id(task: Task) -> str:

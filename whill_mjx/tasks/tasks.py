@@ -50,12 +50,22 @@ def register_task(task: Any) -> Any:
 
     Raises:
         TypeError: it is no task.
-        ValueError: a field is wrong, or another task has its name.
+        ValueError: a field is wrong, or another task has its name or its id of Gymnasium.
     """
+    name = _as_task(task, "register_task").name
+    for other in TASKS:
+        if other != name and in_camel(other) == in_camel(name):
+            raise ValueError(f"register_task: task {name!r} would have the id of Gymnasium that {other!r} has. Give it "
+                             "another name.")
     known = TASKS.add(task, "register_task")
     if "whill_mjx.gym" in sys.modules:  # which gives every task an id, when it is imported
         sys.modules["whill_mjx.gym"].register_id(known)
     return task
+
+
+def in_camel(name: str) -> str:
+    """The name of a task as Gymnasium's ids have it: ObstacleCourse of obstacle_course."""
+    return "".join(part.capitalize() for part in name.split("_"))
 
 
 def unregister_task(name: str) -> None:
