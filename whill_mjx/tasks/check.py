@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -92,11 +92,15 @@ def check_name(task: Task) -> None:
 
 
 def _check_tables(task: Task) -> None:
-    """Refuse budgets or sweeps of another kind than the library asks for."""
+    """Refuse tables of another kind than the library asks for, and ranges of no field."""
+    names = {field.name for field in fields(task)}
     for name, holds, wanted in (
         ("budgets", _is_table(task.budgets), "a dict of Budgets by the name of a preset"),
         ("sweeps", _is_texts(task.sweeps), "a tuple of texts such as 'light=0.5,1'"),
         ("per_period", _is_texts(task.per_period), "a tuple of names of reward terms"),
+        ("ranges", all(one.name in names for one in task.ranges), "a tuple of Fields with the names of its fields"),
+        ("walls", isinstance(task.walls, int) and not isinstance(task.walls, bool), "a whole number"),
+        ("lane", isinstance(task.lane, bool), "True or False"),
     ):
         if not holds:
             raise ValueError(f"task {task.name!r}: {name} is {shown(getattr(task, name))}; it must be {wanted}. "
