@@ -95,13 +95,17 @@ def candidates_of(asked: Asked, found: Search, current: Refit) -> list[Candidate
 
 
 def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int = 1) -> list[Candidate]:
-    """Round `number`: what looks best in the scans is refitted jointly with `current`, the best of it to its end, and
-    so is what might imitate the best; in order of gain."""
+    """Round `number`: what looks best in the scans is refitted, the best of it to its end, and so is what might imitate
+    the best; in order of gain. Beside accepted effects each other one has its chance: a scan knows what effects look
+    like beside the base alone, and beside a limit they look different."""
     refitter, hypotheses = asked.refitter, asked.hypotheses
     taken = {one.effect for one in current.hypotheses}
     left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
-    kinds = [[h for h in left if asked.named(hypotheses[h].effect) == able] for able in (True, False)]
-    chosen = [one for each in kinds for one in _starts(hypotheses, scans, asked.scan, each, asked.thresholds)]
+    if taken:
+        chosen = _of_each(hypotheses, scans[-1], left)
+    else:
+        kinds = [[h for h in left if asked.named(hypotheses[h].effect) == able] for able in (True, False)]
+        chosen = [one for each in kinds for one in _starts(hypotheses, scans, asked.scan, each, asked.thresholds)]
     at = Start.at(current)
 
     def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
@@ -176,6 +180,14 @@ def _starts(
                 order[hypotheses[wide].key] = (wide, start)
                 new += 1
     return list(order.values())
+
+
+def _of_each(hypotheses: Sequence[Hypothesis], scan: Looked, left: Sequence[int]) -> list[tuple[int, np.ndarray]]:
+    """Of each effect out of `left` the hypothesis that gains most in a scan, with all axes, and where to start it."""
+    gain, _, q = scan
+    most = {hypotheses[h].effect: h for h in sorted(left, key=lambda h: gain[h])}
+    widest = [_widest(hypotheses, h, q, [h for h in left if gain[h] > 0]) for h in most.values()]
+    return [(h, start if np.any(start) else _best_start([scan], h)) for h, start in widest]
 
 
 def _rivals(

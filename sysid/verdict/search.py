@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.missing.evidence import Solver, at_fit
 from sysid.missing.joint_fit import Start, moved_last
 from sysid.verdict.agreement import interval_of_sum
 from sysid.verdict.forms import forms_of
@@ -24,7 +23,7 @@ from sysid.verdict.rounds import (
     p_of_last,
     pair_round,
 )  # fmt: skip
-from sysid.verdict.scan import DRAWS, best, null_days, scan_pairs
+from sysid.verdict.scan import DRAWS, null_days, scan_pairs
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def settle(asked: Asked, pairs: PairScan | None) -> Search:
 
 
 def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed]:
-    """Effects one after the other, as long as more is left than days differ by, or any stands out beside them."""
+    """Effects one after the other, as long as a further one may be named beside those before it."""
     current, members, rivals = asked.base, tuple[Candidate, ...](), tuple[Sequence[Candidate], ...]()
     out: list[Weighed] = []
     for _ in range(ROUNDS):
@@ -79,8 +78,7 @@ def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed
         able = [one for one in new if findings.able(one.numbers, asked.thresholds)]
         if len(members) == 2:
             out += [each for one in new[:1] for each in _without_stand_ins(asked, one)]
-        if not able or (asked.wander.p_excess(able[0].numbers.left.excess) >= asked.thresholds.alpha
-                        and not more_stands_out(asked, able[0])):
+        if not able:
             break
         members, rivals, current = able[0].members, able[0].rivals, able[0].members[-1].refit
     return out
@@ -138,20 +136,6 @@ def _with_classes(asked: Asked, pair: Weighed, sets: Sequence[Weighed], alone: M
         found = class_of(asked, mine, there)
         classes[place] = (*found, *(one for one in classes[place] if place and one not in found))
     return replace(pair, numbers=replace(pair.numbers, classes=tuple(map(tuple, classes))))
-
-
-def more_stands_out(asked: Asked, one: Weighed) -> bool:
-    """Whether any further effect stands out beside a set of effects whose forms may be others, by a linear scan. What
-    these forms leave counts as noise."""
-    fit, forms = one.members[-1].refit, forms_of(asked.refitter, one.members[-1].refit, asked.evidence.groups)
-    bent = np.concatenate(forms.bent, axis=1).reshape(*fit.residual.shape, -1)
-    held = np.repeat([0.0, asked.thresholds.form**-2], [len(fit.q), bent.shape[-1]])
-    around = at_fit(asked.evidence, fit.residual, np.concatenate([fit.jacobian, bent], axis=-1),
-                    fit.u - asked.refitter.reference.u, held)
-    _, worth, _ = best(Solver(around), asked.hypotheses, asked.wander)
-    noise = 1 + max(one.numbers.bent.excess, 0.0)
-    return any(asked.scan.p_of(h, float(worth[h]) / noise) < asked.thresholds.alpha
-               for h, each in enumerate(asked.hypotheses) if each.effect not in one.numbers.effects)
 
 
 def _without_stand_ins(asked: Asked, one: Weighed) -> list[Weighed]:
