@@ -126,6 +126,18 @@ def test_what_the_drives_do_not_separate_from_an_effect_shows_beside_the_other_o
     assert next(members for members in found.classes if members[0] == "slope") == ["slope", "track_width"]
 
 
+def test_an_effect_that_looks_different_beside_another_one_is_found(wander):
+    """The scan holds columns against the drives that effects have beside the base; beside slope, `side_force` has
+    another one."""
+    evidence = drives((1.0, 0.0, 0.8, 0.0))
+    design = evidence.design.copy()
+    design[..., 3] = np.random.default_rng(5).standard_normal(design.shape[:2])
+    before = replace(evidence, design=design, products=np.einsum("bni,bnj->bij", design, design),
+                     moments=np.einsum("bni,bn->bi", design, evidence.residual))
+    asked = begin(before, SimpleNamespace(hypotheses=EFFECTS, wander=wander), Linear(evidence), LoopConfig(draws=300))
+    assert named(settle(asked, pairs_of_effects(asked))) == ("named", {"slope", "side_force"})
+
+
 def test_one_class_is_no_pair(wander):
     alike = np.eye(4)
     alike[1, 0] = 0.95
