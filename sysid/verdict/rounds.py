@@ -96,22 +96,27 @@ def candidates_of(asked: Asked, found: Search, current: Refit) -> list[Candidate
 
 def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int = 1) -> list[Candidate]:
     """Round `number`: what looks best in the scans is refitted, the best of it to its end, and so is what might imitate
-    the best; in order of gain. Beside accepted effects each other one has its chance: a scan knows what effects look
-    like beside the base alone, and beside a limit they look different."""
+    the best; in order of gain. A scan knows what effects look like beside the base alone, and beside a limit they look
+    different: in the place of one, every effect beside accepted ones takes a step of such a refit."""
     refitter, hypotheses = asked.refitter, asked.hypotheses
     taken = {one.effect for one in current.hypotheses}
     left = [h for h in range(len(hypotheses)) if hypotheses[h].effect not in taken]
-    if taken:
-        chosen = _of_each(hypotheses, scans[-1], left)
-    else:
-        kinds = [[h for h in left if asked.named(hypotheses[h].effect) == able] for able in (True, False)]
-        chosen = [one for each in kinds for one in _starts(hypotheses, scans, asked.scan, each, asked.thresholds)]
+    kinds = [[h for h in left if asked.named(hypotheses[h].effect) == able] for able in (True, False)]
     at = Start.at(current)
 
     def starts(listed: Sequence[tuple[int, np.ndarray]]) -> list[Start]:
-        return [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes) for h, q in listed]
+        return nearer(refitter, [Start((*at.hypotheses, hypotheses[h]), at.u, np.concatenate([at.q, q]), at.slopes)
+                                 for h, q in listed], current)
 
-    fits = refitter.fit_all(nearer(refitter, starts(chosen), current), FIRST_LOOK)
+    if taken:
+        each = [_of_each(hypotheses, scans[-1], kind) for kind in kinds]
+        looks = [[*zip(listed, refitter.fit_all(starts(listed), 1), strict=True)] for listed in each]
+        likely = [one for look in looks for one in sorted(look, key=lambda one: one[1].cost)[:CANDIDATES]]
+        chosen, begun = [one for one, _ in likely], [Start.at(fit) for _, fit in likely]
+    else:
+        chosen = [one for kind in kinds for one in _starts(hypotheses, scans, asked.scan, kind, asked.thresholds)]
+        begun = starts(chosen)
+    fits = refitter.fit_all(begun, FIRST_LOOK)
     asked.report(f"refits, round {number}")
     best_of = _nearly_best(asked, fits, current)
     for i, fit in zip(best_of, refitter.fit_all([Start.at(fits[i]) for i in best_of], TO_ITS_END), strict=True):
@@ -125,7 +130,7 @@ def refitted(asked: Asked, current: Refit, scans: Sequence[Looked], number: int 
     similar = np.where(asked.similar > asked.thresholds.form, asked.similar, 0.0)
     rivals = _rivals(hypotheses, similar, [h for h, _ in chosen], fits, taken)
     chosen += [(h, _best_start(scans, h)) for h in rivals]
-    fits += refitter.fit_all(nearer(refitter, starts(chosen[len(fits) :]), current), POLISH)
+    fits += refitter.fit_all(starts(chosen[len(fits) :]), POLISH)
     asked.report(f"rivals, round {number}")
     candidates = [candidate_of(asked, h, fit, current) for (h, _), fit in zip(chosen, fits, strict=True)]
     return sorted(candidates, key=lambda one: -one.gain)
