@@ -56,7 +56,7 @@ def _outcome(findings: Findings, priors: Thresholds, judged: Posterior, number: 
     if not findings.able(one, priors):
         if len(one.effects) == 1:
             return "adds too little"
-        return "is wrong about other manoeuvres" if min(one.foretold) <= 0 else "may be another form of the other"
+        return "may be another form of the other" if one.known else "is wrong about other manoeuvres"
     if judged.verdict == "none":
         return "no more than days differ by"
     if number != judged.chosen:

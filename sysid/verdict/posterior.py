@@ -77,6 +77,12 @@ class TriedSet:
     bent: Left  # what is left where all may have other forms
     classes: tuple[tuple[str, ...], ...]  # each effect with those not separated from it, nearest first
 
+    @property
+    def known(self) -> bool:
+        """Whether other manoeuvres foretell every effect but the largest."""
+        largest = max(range(len(self.own)), key=lambda place: self.own[place])
+        return all(gain > 0 for place, gain in enumerate(self.foretold) if place != largest)
+
     def apart(self) -> list[list[str]]:
         """The classes, each without what is named beside it."""
         return [[name for name in members if name == members[0] or name not in self.effects]
@@ -141,12 +147,11 @@ class Findings:
 
     def able(self, one: TriedSet, priors: Thresholds) -> bool:
         """Whether a set may be named: it is no larger than `MOST`, and every effect does more than to mend the form of
-        the others. Beside these it outweighs its prior odds, where what all forms leave counts as noise, and the
-        others' manoeuvres foretell it."""
+        the others. Beside these it outweighs its prior odds, where what all forms leave counts as noise; and the
+        others' manoeuvres foretell it, unless it is the largest: this would be named by itself."""
         noise = 1 + max(one.bent.excess, 0.0)
         worth = min(self.log_weight(gain / noise, 1, priors) for gain in one.own) > 0
-        known = len(one.effects) == 1 or min(one.foretold) > 0
-        return len(one.effects) <= MOST and worth and known
+        return len(one.effects) <= MOST and worth and one.known
 
     def log_weight(self, gain: float, effects: int, priors: Thresholds) -> float:
         """Of an explanation: what it gains, in units of what days differ by, less log(1 / alpha) for each effect."""

@@ -193,6 +193,15 @@ def test_a_further_effect_must_do_more_than_to_mend_the_form_of_the_others():
 
 
 @pytest.mark.quick
+def test_the_smaller_of_two_effects_must_be_foretold_by_other_manoeuvres():
+    first, both = tried(8.0, gain=200.0, bent=8.0), ("quadratic_drag", "slope")
+    pair = replace(tried(0.0, effects=both, gain=280.0, own=(200.0, 90.0)), bent=Left(5.0, 5.0, 0.0))
+    for raised, names in (((30.0, 9.0), 2), ((-3.0, 9.0), 2), ((30.0, -1.0), 1)):
+        given = findings(28.0, [first, replace(pair, foretold=raised)])
+        assert len(given.sets[posterior(given, Thresholds()).chosen].effects) == names
+
+
+@pytest.mark.quick
 def test_a_set_that_was_refitted_in_both_orders_keeps_its_weight_together():
     pairs = [("quadratic_drag", "slope"), ("slope", "quadratic_drag")]
     given = findings(28.0, [tried(0.0, effects=effects, gain=280.0, own=(200.0, 90.0)) for effects in pairs])
