@@ -1,0 +1,20 @@
+"""Tests of nodes do not hear one another."""
+
+import tempfile
+
+import pytest
+import ros_graph
+
+pytestmark = pytest.mark.quick
+
+
+def test_a_domain_is_not_used_again_while_what_a_test_left_behind_may_still_speak(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(ros_graph.random, "randrange", lambda _: 6)
+    with ros_graph.free_domain() as one, ros_graph.free_domain() as other:
+        assert (one, other) == (7, 8)
+    with ros_graph.free_domain() as later:
+        assert later == 9
+    monkeypatch.setattr(ros_graph, "LINGER", 0.0)
+    with ros_graph.free_domain() as again:
+        assert again == 7
