@@ -191,7 +191,8 @@ def _of_each(hypotheses: Sequence[Hypothesis], scan: Looked, left: Sequence[int]
     """Of each effect out of `left` the hypothesis that gains most in a scan, with all axes, and where to start it."""
     gain, _, q = scan
     most = {hypotheses[h].effect: h for h in sorted(left, key=lambda h: gain[h])}
-    widest = [_widest(hypotheses, h, q, [h for h in left if gain[h] > 0]) for h in most.values()]
+    gaining = [h for h in left if gain[h] > 0]
+    widest = [_widest(hypotheses, h, q, gaining) for h in most.values()]
     return [(h, start if np.any(start) else _best_start([scan], h)) for h, start in widest]
 
 

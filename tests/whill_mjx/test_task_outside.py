@@ -127,6 +127,16 @@ class Mine(Task):
 """
 
 
+def refused(folder, body, said):
+    """The file of a task with this line in its class, after a command has refused it in one line."""
+    path = folder / f"wrong_{abs(hash(body))}.py"
+    path.write_text(f"{HEAD}    {body}\n")
+    with pytest.raises(OptionError, match=said) as caught:
+        named_task(f"{path}:Mine")
+    assert "\n" not in str(caught.value)
+    return path
+
+
 @pytest.mark.quick
 @pytest.mark.parametrize(("method", "said"), [
     ("sample_world(self, key): raise KeyError('pillar')", "sample_world, line 10: KeyError: 'pillar'"),
@@ -153,11 +163,7 @@ class Mine(Task):
     ("rewards(self, moment): return {'a': moment.time_s}\n    per_period = ('tiem',)", "per_period has 'tiem'.* a."),
 ])  # fmt: skip
 def test_a_method_that_cannot_work_is_named_before_anything_is_compiled(method, said, tmp_path):
-    path = tmp_path / f"wrong_{abs(hash(method))}.py"
-    path.write_text(f"{HEAD}    def {method}\n")
-    with pytest.raises(OptionError, match=said) as caught:
-        named_task(f"{path}:Mine")
-    assert "\n" not in str(caught.value)
+    path = refused(tmp_path, f"def {method}", said)
     with pytest.raises(ValueError, match=said):
         make_env(find_task(f"{path}:Mine"))
 
@@ -171,11 +177,7 @@ def test_a_method_that_cannot_work_is_named_before_anything_is_compiled(method, 
     ("budget = {}", "'budget' is never used; 'budgets' would be"),
 ])  # fmt: skip
 def test_a_name_that_the_library_would_pass_over_is_refused(body, said, tmp_path):
-    path = tmp_path / f"passed_{abs(hash(body))}.py"
-    path.write_text(f"{HEAD}    {body}\n")
-    with pytest.raises(OptionError, match=said) as caught:
-        named_task(f"{path}:Mine")
-    assert "\n" not in str(caught.value)
+    refused(tmp_path, body, said)
 
 
 @pytest.mark.quick
