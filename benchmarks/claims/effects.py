@@ -98,7 +98,7 @@ CLAIMS = (
         MISSING,
         "False alarms and other checks of the verdict",
         "undeclared",
-        "The same logs. Fresh ones are judged by the present decision, from evidence kept before its last change. The "
+        "The same logs. Fresh ones are judged by the decision before its [last change](notes/pairs.md). The "
         "weights were chosen with the others in view. "
         "Effects taken out of the catalogue are of an earlier decision.",
         ("figure", "value"),

@@ -41,6 +41,15 @@ def check_own_class(what: str, kind: type, base: type) -> None:
                              "another.")
 
 
+def check_fixed(what: str, value: Any) -> None:
+    """Raise ValueError for a record with a list or an array in it: compiled programs are found by its hash."""
+    try:
+        hash(value)
+    except TypeError as error:
+        raise ValueError(f"{what}: {error}; its fields must be numbers, texts or tuples of them. Give a tuple for an "
+                         "array or a list.") from error
+
+
 def _check_defaults(what: str, kind: type) -> None:
     """Refuse a default without a type: a dataclass would go on with the one of the class above."""
     for field in dataclasses.fields(kind):

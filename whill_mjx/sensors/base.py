@@ -19,7 +19,7 @@ import numpy as np
 from flax import struct
 
 from whill_mjx.io.fields import Field, check_fields
-from whill_mjx.io.own_class import check_own_class
+from whill_mjx.io.own_class import check_fixed, check_own_class
 from whill_mjx.tasks.terms import Moment
 
 FIELDS = (
@@ -298,11 +298,7 @@ def as_sensors(observations: Any, known: Mapping[str, type[Sensor]]) -> Sensors:
         if isinstance(sensor, type) or not dataclasses.is_dataclass(sensor) or not isinstance(sensor, Sensor):
             raise ValueError(f"observation {name!r} is {sensor!r}, no sensor. Give an instance of a frozen dataclass "
                              "that derives from whill_mjx.sensors.base.Sensor.")
-        try:
-            hash(sensor)
-        except TypeError as error:
-            raise ValueError(f"observation {name!r}, {type(sensor).__name__}: {error}; its fields must be numbers, "
-                             "texts or tuples of them. Give a tuple for an array or a list.") from error
+        check_fixed(f"observation {name!r}, {type(sensor).__name__}", sensor)
         if not str(name):
             raise ValueError(f"observation {name!r}, {type(sensor).__name__}: has an empty name. Give it one.")
         found.append((str(name), sensor))

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.io.fields import shown
-from whill_mjx.io.own_class import ALIKE, check_own_class
+from whill_mjx.io.own_class import ALIKE, check_fixed, check_own_class
 from whill_mjx.io.registry import failed
 from whill_mjx.sensors.base import as_sensors
 from whill_mjx.sensors.registry import known_sensors
@@ -66,11 +66,7 @@ def check_is_task(task: Any) -> None:
     """Raise ValueError for anything else than a task, such as its class, and for one with a list or array in it."""
     if not isinstance(task, Task):
         raise ValueError(f"task is {task!r}; give a Task such as Corridor(), or the name of one.")
-    try:
-        hash(task)
-    except TypeError as error:
-        raise ValueError(f"task {task.name!r}: {error}; its fields must be numbers, texts or tuples of them. Give a "
-                         "tuple for an array or a list.") from error
+    check_fixed(f"task {task.name!r}", task)
 
 
 def fitted_task(task: Task, spec: VehicleSpec) -> Task:
