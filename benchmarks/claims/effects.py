@@ -67,9 +67,9 @@ CLAIMS = (
         "it. 1x is the "
         'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns "fresh" are '
         "of the decision before its last change; eight of these logs have backlash, which is never named. They were "
-        "first judged blind, by an earlier one: single effects as now, both of two in 35 of 57. One rule was dropped "
-        "with them in view, which changed 2 of 295 verdicts. Columns 2x and 4x are of an earlier decision, on logs that its "
-        "weights were chosen with; the others are older still.",
+        "first judged blind, by an earlier one: single effects as now, both of two in 35 of 57. One rule was "
+        "dropped with them in view, which changed 2 of 295 verdicts. Columns 2x and 4x are of an earlier decision, on "
+        "logs that its weights were chosen with; the others are older still.",
         ("figure", "2x, fresh", "4x, fresh", "2x", "4x", "2x, noise x2", "4x, noise x2", "4x, heavy scooter"),
         tuple(
             (
