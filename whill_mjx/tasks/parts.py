@@ -15,17 +15,26 @@ from whill_mjx.world.scene import Boxes, Marker, box, stack_boxes
 OBSTACLES = ((0.78, 0.20, 0.16), (0.88, 0.58, 0.14), (0.26, 0.55, 0.24), (0.66, 0.46, 0.28))
 
 
+AT_ONCE = 32
+"""Numbers that are drawn together: one by one, each would be a hundred operations to compile."""
+
+
 class Draws:
     """Uniform numbers from one key, each from its own; without a key every draw gives its fixed value."""
 
     def __init__(self, key: jax.Array | None):
         self.key, self.count = key, 0
+        self.numbers = jnp.zeros(0)
 
     def __call__(self, low: float, high: float, fixed: float) -> jax.Array:
         if self.key is None:
             return jnp.asarray(fixed, float)
+        if self.count % AT_ONCE == 0:
+            places = jnp.arange(self.count + 1, self.count + 1 + AT_ONCE)
+            self.numbers = jax.vmap(lambda place: jax.random.uniform(jax.random.fold_in(self.key, place)))(places)
+        number = self.numbers[self.count % AT_ONCE]
         self.count += 1
-        return jax.random.uniform(jax.random.fold_in(self.key, self.count), minval=low, maxval=high)
+        return low + (high - low) * number
 
     def sign(self) -> jax.Array:
         """-1 or 1; 1 when fixed."""

@@ -46,11 +46,10 @@ def neutral() -> Photometry:
 def draw_photometry(key: jax.Array, ranges: AugmentRanges | None = None) -> Photometry:
     """Change of one episode, each value uniform in its range."""
     ranges = ranges or AugmentRanges()
-    keys = jax.random.split(key, 5)
     names = ("brightness", "contrast", "hue", "saturation", "noise")
-    bounds = (getattr(ranges, name) for name in names)
-    drawn = (jax.random.uniform(k, minval=low, maxval=high) for k, (low, high) in zip(keys, bounds, strict=True))
-    return Photometry(*drawn)
+    low, high = jnp.array([getattr(ranges, name) for name in names], float).T
+    numbers = jax.vmap(jax.random.uniform)(jax.random.split(key, len(names)))
+    return Photometry(*(low + (high - low) * numbers))
 
 
 def augment(image: jax.Array, change: Photometry, key: jax.Array) -> jax.Array:

@@ -27,9 +27,14 @@ def randomize_params(key: jax.Array, params: VehicleParams, spread: float) -> Ve
         params: parameters of one instance.
         spread: relative standard deviation, about; 0 gives `params` back.
     """
-    leaves, tree = jax.tree.flatten(params)
+    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, params))
+    most = max((leaf.size for leaf in leaves), default=0)
     keys = jax.random.split(key, len(leaves))
-    drawn = [_scale(k, jnp.asarray(leaf), spread) for k, leaf in zip(keys, leaves, strict=True)]
+    factors = jnp.exp(spread * jax.vmap(lambda key: jax.random.truncated_normal(key, -2.0, 2.0, (most,)))(keys))
+    drawn = [
+        leaf * factor[: leaf.size].reshape(leaf.shape) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+        for leaf, factor in zip(leaves, factors, strict=True)
+    ]
     return jax.tree.unflatten(tree, drawn)
 
 
@@ -105,54 +110,51 @@ def read_variation(text: str) -> Variation:
 
 def vary_params(key: jax.Array, params: VehicleParams, variations: tuple[Variation, ...]) -> VehicleParams:
     """Parameters of one instance with each variation drawn from its range."""
-    for index, one in enumerate(variations):
-        value = jax.random.uniform(jax.random.fold_in(key, index), minval=one.low, maxval=one.high)
-        params = with_parameter(params, one.name, value, one.relative)
+    numbers = jax.vmap(lambda place: jax.random.uniform(jax.random.fold_in(key, place)))(jnp.arange(len(variations)))
+    for one, number in zip(variations, numbers, strict=True):
+        params = with_parameter(params, one.name, one.low + (one.high - one.low) * number, one.relative)
     return params
-
-
-def _scale(key: jax.Array, leaf: jax.Array, spread: float) -> jax.Array:
-    if not jnp.issubdtype(leaf.dtype, jnp.floating):
-        return leaf
-    normal = jax.random.truncated_normal(key, -2.0, 2.0, leaf.shape, leaf.dtype)
-    return leaf * jnp.exp(spread * normal)
 
 
 def randomize_looks(key: jax.Array, scene: Scene) -> Scene:
     """The scene with other colours, tiles, sun and sky. Shapes and places stay; the goal marker stays blue."""
-    keys = iter(jax.random.split(key, 20))
+    keys = jax.random.split(key, 20)
+    numbers = jax.vmap(lambda key: jax.random.uniform(key, (3,)))(keys)  # one by one, they take long to compile
+    rows = iter(range(1, len(keys)))
+
+    def draw(low: float, high: float, size: int | None = None) -> jax.Array:
+        row = numbers[next(rows)]
+        return low + (high - low) * (row[0] if size is None else row[:size])
+
     boxes, marker, looks = scene.boxes, scene.marker, scene.looks
-    paint = jax.random.uniform(next(keys), boxes.colour.shape, minval=0.08, maxval=0.92)
+    paint = jax.random.uniform(keys[0], boxes.colour.shape, minval=0.08, maxval=0.92)
     # No other thing may be taken for the marker: a box's blue never exceeds its red and green.
     paint = paint.at[:, 2].set(jnp.minimum(paint[:, 2], jnp.maximum(paint[:, 0], paint[:, 1])))
-    shade = jax.random.uniform(next(keys), minval=0.6, maxval=1.05)
-    blue = jnp.clip(marker.colour * shade + jax.random.uniform(next(keys), (3,), minval=0.0, maxval=0.08), 0.0, 1.0)
+    shade = draw(0.6, 1.05)
+    blue = jnp.clip(marker.colour * shade + draw(0.0, 0.08, 3), 0.0, 1.0)
 
-    azimuth = jax.random.uniform(next(keys), minval=-jnp.pi, maxval=jnp.pi)
-    elevation = jax.random.uniform(next(keys), minval=0.5, maxval=1.4)
+    azimuth, elevation = draw(-jnp.pi, jnp.pi), draw(0.5, 1.4)
     sun = jnp.stack([
         jnp.cos(elevation) * jnp.cos(azimuth), jnp.cos(elevation) * jnp.sin(azimuth), jnp.sin(elevation)
     ])
-    base = jax.random.uniform(next(keys), minval=0.25, maxval=0.7)
-    tint = jax.random.uniform(next(keys), (3,), minval=0.9, maxval=1.1)
-    step = jax.random.uniform(next(keys), minval=0.0, maxval=0.15)
+    base, tint, step = draw(0.25, 0.7), draw(0.9, 1.1, 3), draw(0.0, 0.15)
     ground = jnp.clip(jnp.stack([base * tint, (base - step) * tint]), 0.0, 1.0)
-    tile = jax.random.uniform(next(keys), minval=0.3, maxval=0.9)
-    horizon = jax.random.uniform(next(keys), minval=0.6, maxval=0.95) * jnp.array([0.97, 1.0, 1.03])
-    zenith = horizon * jax.random.uniform(next(keys), (3,), minval=0.5, maxval=0.95)
+    tile = draw(0.3, 0.9)
+    horizon = draw(0.6, 0.95) * jnp.array([0.97, 1.0, 1.03])
+    zenith = horizon * draw(0.5, 0.95, 3)
     looks = dataclasses.replace(
         looks,
         sun=sun,
-        ambient=jax.random.uniform(next(keys), minval=0.4, maxval=0.7),
-        diffuse=jax.random.uniform(next(keys), minval=0.3, maxval=0.6),
+        ambient=draw(0.4, 0.7),
+        diffuse=draw(0.3, 0.6),
         sky_horizon=jnp.clip(horizon, 0.0, 1.0),
         sky_zenith=jnp.clip(zenith, 0.0, 1.0),
         ground=ground,
         tile=tile,
-        tile_offset=jax.random.uniform(next(keys), (2,), maxval=1.0) * tile,
-        noise=jax.random.uniform(next(keys), maxval=0.12),
-        grain=jax.random.uniform(next(keys), maxval=0.10),
-        seed=jax.random.bits(next(keys), dtype=jnp.uint32),
+        tile_offset=draw(0.0, 1.0, 2) * tile,
+        noise=draw(0.0, 0.12),
+        grain=draw(0.0, 0.10),
+        seed=jax.random.bits(keys[next(rows)], dtype=jnp.uint32),
     )
     solid, goal = dataclasses.replace(boxes, colour=paint), dataclasses.replace(marker, colour=blue)
     return dataclasses.replace(scene, boxes=solid, marker=goal, looks=looks)

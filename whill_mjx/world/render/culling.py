@@ -6,7 +6,7 @@ distorts, so that they hold for every lens.
 
 from __future__ import annotations
 
-from itertools import combinations
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +21,6 @@ NEAREST = 1e-3
 """Depth at which primitives that reach behind the camera are cut off [m]."""
 NOTHING = 1e9
 """Edge of an empty rectangle, and depth of what cannot be seen."""
-SIGNS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], np.float32)
-EDGES = np.array([(a, b) for a, b in combinations(range(8), 2) if np.abs(SIGNS[a] - SIGNS[b]).sum() == 2])
-SHADOW_EDGES = np.concatenate([EDGES, EDGES + 8, np.stack([np.arange(8), np.arange(8) + 8], 1)])
 LOWEST_SUN = 0.05
 """Shadows on the ground are as long as those of a sun this high at least (sine of its height)."""
 
@@ -39,8 +36,12 @@ class Bounds:
     near: jax.Array  # m: no point of it has less depth
 
 
-Corners = list[tuple[jax.Array, jax.Array, jax.Array]]
-"""World x, y and z, each (P,), of every corner: apart, so that XLA makes one elementwise kernel of all that follows."""
+WIDER = (jnp.minimum, jnp.maximum) * 2
+"""Of two rectangles' sides, in the order of `Bounds`."""
+
+Corners = tuple[jax.Array, jax.Array, jax.Array]
+"""World x, y and z of the corners of P bodies, each (2, ..., 2, P): corners whose places differ in one of the axes of
+size 2 are joined by an edge."""
 
 
 def upright_corners(boxes: Boxes) -> Corners:
@@ -67,69 +68,69 @@ def round_corners(rounds: Rounds) -> Corners:
 
 
 def _corners(centre, ways, half) -> Corners:
-    corners = []
-    for signs in SIGNS:
-        point = []
-        for row in range(3):
-            reach = sum(float(sign) * size * way[row] for sign, size, way in zip(signs, half, ways, strict=True))
-            point.append(centre[:, row] + reach)
-        corners.append(tuple(point))
-    return corners
+    signs = [np.array([-1.0, 1.0], np.float32).reshape(shape) for shape in ((2, 1, 1, 1), (2, 1, 1), (2, 1))]
+
+    def along(row: int) -> jax.Array:
+        reach = [sign * size * way[row] for sign, size, way in zip(signs, half, ways, strict=True)]
+        return centre[:, row] + reach[0] + reach[1] + reach[2]
+
+    return along(0), along(1), along(2)
 
 
 def upright_bounds(view: View, boxes: Boxes) -> Bounds:
     """Rectangles of upright boxes."""
-    return bounds(view, upright_corners(boxes), boxes.mask, EDGES)
+    return bounds(view, upright_corners(boxes), boxes.mask)
 
 
 def shadow_corners(corners: Corners, sun: jax.Array) -> Corners:
     """The corners, and where the sun throws them on the ground; their hull holds the shadowed space."""
-    steep = 1.0 / jnp.maximum(sun[2], LOWEST_SUN)
-    thrown = []
-    for x, y, z in corners:
-        fall = jnp.maximum(z, 0.0) * steep
-        thrown.append((x - fall * sun[0], y - fall * sun[1], z - fall * sun[2]))
-    return [*corners, *thrown]
+    x, y, z = corners
+    thrown = np.array([0.0, 1.0], np.float32).reshape(2, *[1] * z.ndim)
+    fall = thrown * jnp.maximum(z, 0.0) * (1.0 / jnp.maximum(sun[2], LOWEST_SUN))
+    return x - fall * sun[0], y - fall * sun[1], z - fall * sun[2]
 
 
-def bounds(view: View, corners: Corners, mask: jax.Array, edges: np.ndarray) -> Bounds:
-    """Rectangles of convex bodies with these `corners` and `edges` (m, 2) between them; `mask` (P,)."""
-    position, rotation = view.position, view.rotation
-    camera = []
-    for corner in corners:
-        way = [corner[row] - position[row] for row in range(3)]
-        camera.append([sum(way[row] * rotation[row, axis] for row in range(3)) for axis in range(3)])
-    low_u = low_v = near = jnp.full_like(camera[0][2], NOTHING)
-    high_u = high_v = -low_u
-    for x, y, z in camera:
-        inverse = 1.0 / jnp.maximum(z, NEAREST)
-        before, u, v = z >= NEAREST, x * inverse, y * inverse
-        low_u, high_u = _widen(low_u, high_u, u, before)
-        low_v, high_v = _widen(low_v, high_v, v, before)
-        near = jnp.where(before, jnp.minimum(near, z), near)
+def bounds(view: View, corners: Corners, mask: jax.Array) -> Bounds:
+    """Rectangles of convex bodies with these `corners`; `mask` (P,).
+
+    Corners are axes of arrays, reduced in loops. Written out one by one, they became one kernel of two minutes to
+    compile.
+    """
+    way = [place - origin for place, origin in zip(corners, view.position, strict=True)]
+    x, y, z = (sum(way[row] * view.rotation[row, axis] for row in range(3)) for axis in range(3))
+    ways = tuple(range(z.ndim - 1))
+    inverse, before = 1.0 / jnp.maximum(z, NEAREST), z >= NEAREST
+    sides = [_sides(x * inverse, y * inverse, before)]
     cut_through = jnp.zeros_like(mask)
-    for one, other in edges:
-        (x, y, z), (x2, y2, z2) = camera[one], camera[other]
-        rise = z2 - z
-        share = jnp.clip((NEAREST - z) / jnp.where(jnp.abs(rise) < 1e-9, 1e-9, rise), 0.0, 1.0)
-        crosses = (z >= NEAREST) != (z2 >= NEAREST)
-        low_u, high_u = _widen(low_u, high_u, (x + share * (x2 - x)) * (1.0 / NEAREST), crosses)
-        low_v, high_v = _widen(low_v, high_v, (y + share * (y2 - y)) * (1.0 / NEAREST), crosses)
-        cut_through = cut_through | crosses
+    for axis in ways:
+        (x1, x2), (y1, y2), (z1, z2) = (_ends(place, axis) for place in (x, y, z))
+        rise = z2 - z1
+        share = jnp.clip((NEAREST - z1) / jnp.where(jnp.abs(rise) < 1e-9, 1e-9, rise), 0.0, 1.0)
+        crosses = (z1 >= NEAREST) != (z2 >= NEAREST)
+        u, v = ((one + share * (other - one)) * (1.0 / NEAREST) for one, other in ((x1, x2), (y1, y2)))
+        sides.append(_sides(u, v, crosses))
+        cut_through = cut_through | crosses.any(ways[:-1])
+    near = jnp.where(before, z, NOTHING).min(ways)
     near = jnp.where(cut_through, 0.0, near * (1.0 - 1e-5))
     shown = mask & (near < 0.5 * NOTHING)
     empty = (NOTHING, -NOTHING, NOTHING, -NOTHING, NOTHING)
-    edges_of = (low_u, high_u, low_v, high_v, near)
-    return Bounds(*(jnp.where(shown, value, nothing) for value, nothing in zip(edges_of, empty, strict=True)))
+    widest = [reduce(pick, every) for pick, every in zip(WIDER, zip(*sides, strict=True), strict=True)]
+    return Bounds(*(jnp.where(shown, value, nothing) for value, nothing in zip([*widest, near], empty, strict=True)))
 
 
-def _widen(low, high, place, used) -> tuple[jax.Array, jax.Array]:
-    """An interval that also holds `place`, with some room for rounding."""
-    slack = 1e-5 * (1.0 + jnp.abs(place))
-    return (
-        jnp.where(used, jnp.minimum(low, place - slack), low),
-        jnp.where(used, jnp.maximum(high, place + slack), high),
-    )
+def _ends(places: jax.Array, axis: int) -> tuple[jax.Array, jax.Array]:
+    """Both ends of the edges along an axis of size 2."""
+    return jax.lax.index_in_dim(places, 0, axis, False), jax.lax.index_in_dim(places, 1, axis, False)
+
+
+def _sides(u: jax.Array, v: jax.Array, used: jax.Array) -> tuple[jax.Array, ...]:
+    """Smallest and largest u, then v, of the used ones of places (2, ..., 2, P), with some room for rounding."""
+    sides = []
+    for place in (u, v):
+        slack = 1e-5 * (1.0 + jnp.abs(place))
+        sides.append(jnp.where(used, place - slack, NOTHING).min(range(place.ndim - 1)))
+        sides.append(jnp.where(used, place + slack, -NOTHING).max(range(place.ndim - 1)))
+    return tuple(sides)
 
 
 def strip_lists(boxes: Bounds, view: View, strips: int, keep: int) -> jax.Array:

@@ -245,7 +245,7 @@ def _listed(view: View, corners, sun, kind: Kind, sort: bool) -> Listed:
     table, mask, shadow = kind
     count = table.shape[0]
     extra = -count % CHUNK
-    boxes = culling.bounds(view, corners, mask, culling.EDGES)
+    boxes = culling.bounds(view, corners, mask)
     order = None
     if sort and count > CHUNK:
         order = jnp.argsort(boxes.near)
@@ -259,7 +259,7 @@ def _listed(view: View, corners, sun, kind: Kind, sort: bool) -> Listed:
     sides = (boxes.low_u, boxes.high_u, boxes.low_v, boxes.high_v)
     dark = None
     if shadow is not None:
-        cast = culling.bounds(view, culling.shadow_corners(corners, sun), mask, culling.SHADOW_EDGES)
+        cast = culling.bounds(view, culling.shadow_corners(corners, sun), mask)
         dark = pad((cast.low_u, cast.high_u, cast.low_v, cast.high_v))
     return Listed(table, pad((*sides, boxes.near)), order, shadow, dark)
 

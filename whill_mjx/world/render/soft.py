@@ -9,6 +9,7 @@ face is seen edge-on. Flat colours; upright boxes, marker and blocks; no texture
 from __future__ import annotations
 
 from functools import partial
+from itertools import combinations
 from typing import NamedTuple
 
 import jax
@@ -16,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
-from whill_mjx.world.render.culling import EDGES, SIGNS
 from whill_mjx.world.render.tables import parts_of
 from whill_mjx.world.render.visibility import into_frame
 from whill_mjx.world.scene import Looks, Scene
 
+SIGNS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], np.float32)
+"""Of the eight corners of a box."""
+EDGES = np.array([(a, b) for a, b in combinations(range(8), 2) if np.abs(SIGNS[a] - SIGNS[b]).sum() == 2])
 SKY_DEPTH = 100.0
 """Depth at which the sky stands [m]."""
 
