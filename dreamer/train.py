@@ -38,7 +38,7 @@ __all__ = ["TrainingOptions", "TrainResult", "TrainState", "evaluate", "init_sta
 EvalFn = Callable[[Params, int], dict[str, float]]
 StopFn = Callable[[dict[str, float]], bool]
 P = ParamSpec("P")
-COMPILING = "compiling training and evaluation: usually 1 to 4 minutes, seconds where they are kept of an earlier run"
+COMPILING = "compiling the training: usually 1 to 2 minutes, seconds where its program is kept of an earlier run"
 AGREE_EVERY = 16
 """Iterations between the moments at which several processes agree on the clock."""
 
@@ -86,9 +86,10 @@ class TrainingOptions:
     eval_fn: EvalFn | None = None
     """(params, env_steps) -> figures, logged as eval/..."""
     eval_ahead: Callable[[Params], Any] | None = None
-    """Called once in a thread, with the parameters at the start, while the run's own program is compiled: the same
-    evaluation, say. Evaluations that are due before it is done are made after it, with the parameters of their time.
-    Training goes on meanwhile, and lines are logged in order. Not with several devices."""
+    """Called once in a thread after the first iteration: the same evaluation, say, so that it is compiled beside the
+    training. Evaluations that are due before it is done are made after it, with the parameters of their time. Training
+    goes on meanwhile, and lines are logged in order. Not with several devices. It begins so late since two programs
+    that are compiled side by side take longer than one after the other."""
     eval_every: int = 10_000
     """Control steps between evaluations; one more happens at the end."""
     checkpoint_every_s: float | None = None
@@ -212,8 +213,7 @@ class _Run:
             return seeds.compile_iterations(self.env, self.config, self.state, step)
 
         self._compiled = compiled
-        if options.eval_ahead is not None and mesh is None and self.env_steps < self.total_steps:
-            self._ready = in_thread(options.eval_ahead, copied(self.state.agent.acting))
+        self._ahead = options.eval_ahead if mesh is None else None
         options.announce(COMPILING)
         step = train_iteration if self._counted else pretrain.pretrain_iteration
         self._iterate = compiled(step) if early is None else early.result()
@@ -298,6 +298,8 @@ class _Run:
         if self._iterations == 1:
             jax.block_until_ready(metrics)
             self.options.announce(f"first step after {time.monotonic() - self._began:.0f} s")
+            if self._ahead is not None:
+                self._ready = in_thread(self._ahead, copied(self.state.agent.acting))
         return begins
 
     def _log_where_due(self, now: float, finished: bool, begins: bool) -> None:

@@ -85,9 +85,8 @@ class _Run:
         self.done = int(self.state.updates)
         self.logged = self.env_steps // options.eval_every
         _keep_lines(self.out / "metrics.jsonl", self.env_steps)
-        ahead = options.eval_ahead if self.done < self.last else None
         options.announce(COMPILING)
-        self.ready = [] if ahead is None else [in_thread(ahead, copied(self.state.params))]
+        self.ready: list[Any] = []
         compiled = early.result()
         self.run = lambda state: compiled(state, total)
         options.announce(f"training; its program was ready after {time.monotonic() - self.began:.0f} s")
@@ -120,6 +119,8 @@ class _Run:
             if running is None:
                 jax.block_until_ready(metrics)
                 self.options.announce(f"first step after {time.monotonic() - self.began:.0f} s")
+                if self.options.eval_ahead is not None:
+                    self.ready = [in_thread(self.options.eval_ahead, copied(self.state.params))]
             running = metrics
             if self._due(self.done):
                 line = self._evaluated(metrics)

@@ -30,8 +30,8 @@ class Draws:
         if self.key is None:
             return jnp.asarray(fixed, float)
         if self.count % AT_ONCE == 0:
-            places = jnp.arange(self.count + 1, self.count + 1 + AT_ONCE)
-            self.numbers = jax.vmap(lambda place: jax.random.uniform(jax.random.fold_in(self.key, place)))(places)
+            key, places = self.key, jnp.arange(self.count + 1, self.count + 1 + AT_ONCE)
+            self.numbers = jax.vmap(lambda place: jax.random.uniform(jax.random.fold_in(key, place)))(places)
         number = self.numbers[self.count % AT_ONCE]
         self.count += 1
         return low + (high - low) * number
