@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import io
 import re
 import runpy
 import shlex
 import sys
+import tempfile
 from pathlib import Path
 
 import tyro
@@ -46,17 +46,19 @@ def commands(text):
 
 def refusal(words):
     """What the command's parser says against these words, or nothing."""
-    sys.argv, said = words[2:], io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-            runpy.run_module(words[2], run_name="__main__", alter_sys=True)
-    except Parsed:
-        return ""
-    except SystemExit as end:
-        text = said.getvalue().strip()
-        return "" if not end.code or FILES.search(text) else text.splitlines()[-1]
-    except ImportError as error:
-        return str(error)
+    sys.argv = words[2:]
+    with tempfile.TemporaryFile("w+") as said:  # a file of the system: rclpy asks stderr for its number
+        try:
+            with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+                runpy.run_module(words[2], run_name="__main__", alter_sys=True)
+        except Parsed:
+            return ""
+        except SystemExit as end:
+            said.seek(0)
+            text = said.read().strip()
+            return "" if not end.code or FILES.search(text) else text.splitlines()[-1]
+        except ImportError as error:
+            return str(error)
     return "it does not parse its words"
 
 

@@ -371,12 +371,13 @@ CLAIMS = (
         "Seconds until something happens",
         "speed",
         "Fresh processes: the first finds no compiled programs, the others what it left, with another seed. "
-        "The host did other work beside them.",
+        "The host did other work beside them. [What compilation waited for](notes/compilation.md) is told apart.",
         ("what", "cold [s]", "warm [s]"),
         (
             ("first step of a training (obstacle course), one GPU", "{first_step_cold_s}", "{first_step_warm_s}"),
             ("first step of a `WhillEnv`, one GPU", "{env_first_step_cold_s}", "{env_first_step_warm_s}"),
             ("PPO to 99 % of new obstacle courses, one GPU", "{ppo_99_cold_s}", "{ppo_99_warm_s}"),
+            ("DreamerV3, the obstacle course's whole training, one GPU", "{course_cold_s}", "{course_warm_s}"),
         ),
     ),
     Claim(
