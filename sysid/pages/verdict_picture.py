@@ -56,7 +56,8 @@ def _outcome(findings: Findings, priors: Thresholds, judged: Posterior, number: 
     if not findings.able(one, priors):
         if len(one.effects) == 1:
             return "adds too little"
-        return "may be another form of the other" if one.known else "is wrong about other manoeuvres"
+        known = findings.borne_out(one, priors)
+        return "may be another form of the other" if known else "is wrong about other manoeuvres"
     if judged.verdict == "none":
         return "no more than days differ by"
     if number != judged.chosen:

@@ -72,16 +72,10 @@ class TriedSet:
     p: tuple[float, ...]  # of each effect beside other forms of the others, family-wise; what these leave is noise
     left: Left
     own: tuple[float, ...]  # by how much each effect lowers the cost beside other forms of the others
-    foretold: tuple[float, ...]
-    """Lower 95 % end of how much each effect so raises the log density of manoeuvres that the others predict."""
+    foretold: tuple[tuple[float, ...], ...]
+    """By how much each effect so raises the log density of each manoeuvre, as the others predict it."""
     bent: Left  # what is left where all may have other forms
     classes: tuple[tuple[str, ...], ...]  # each effect with those not separated from it, nearest first
-
-    @property
-    def known(self) -> bool:
-        """Whether other manoeuvres foretell every effect but the largest."""
-        largest = max(range(len(self.own)), key=lambda place: self.own[place])
-        return all(gain > 0 for place, gain in enumerate(self.foretold) if place != largest)
 
     def apart(self) -> list[list[str]]:
         """The classes, each without what is named beside it."""
@@ -148,10 +142,18 @@ class Findings:
     def able(self, one: TriedSet, priors: Thresholds) -> bool:
         """Whether a set may be named: it is no larger than `MOST`, and every effect does more than to mend the form of
         the others. Beside these it outweighs its prior odds, where what all forms leave counts as noise; and the
-        others' manoeuvres foretell it, unless it is the largest: this would be named by itself."""
+        manoeuvres bear it out, unless it is the largest: this would be named by itself."""
         noise = 1 + max(one.bent.excess, 0.0)
         worth = min(self.log_weight(gain / noise, 1, priors) for gain in one.own) > 0
-        return len(one.effects) <= MOST and worth and one.known
+        return len(one.effects) <= MOST and worth and self.borne_out(one, priors)
+
+    def borne_out(self, one: TriedSet, priors: Thresholds) -> bool:
+        """Whether manoeuvres bear out every effect but the largest, whose size the others gave: together they raise the
+        log density, and none lowers it by as much as the prior odds. Against a true effect, one does so with a
+        probability of `alpha` at most, as with any ratio of likelihoods."""
+        largest = max(range(len(one.own)), key=lambda place: one.own[place])
+        smaller = [gains for place, gains in enumerate(one.foretold) if place != largest]
+        return all(sum(gains) > 0 and self.log_weight(-2 * min(gains), 1, priors) < 0 for gains in smaller)
 
     def log_weight(self, gain: float, effects: int, priors: Thresholds) -> float:
         """Of an explanation: what it gains, in units of what days differ by, less log(1 / alpha) for each effect."""
@@ -248,15 +250,15 @@ def as_json(findings: Findings) -> dict[str, Any]:
 
 def from_json(content: dict[str, Any], where: str = "findings") -> Findings:
     """The findings of a file; ValueError for a value of another kind, or a set whose lists are not of one length."""
-    known = _of(Findings, content)  # older files have more
+    known = _of(Findings, upgraded(KIND, content))  # older files have more
     if isinstance(sets := known.get("sets"), list):
         known["sets"] = [_of(TriedSet, one) if isinstance(one, dict) else one for one in sets]
     findings = record(where, Findings, known)
     for index, one in enumerate(findings.sets):
         lengths = {len(each) for each in (one.effects, one.variants, one.p, one.own, one.foretold, one.classes)}
-        if len(lengths) != 1 or 0 in lengths or not all(one.classes):
+        if len(lengths) != 1 or 0 in lengths or not all(one.classes) or not all(one.foretold):
             raise ValueError(f"{where}: sets[{index}]: effects, variants, p, own, foretold and classes must be of one "
-                             "length, above 0.")
+                             "length, above 0, and so must the members of foretold and classes.")
     for name in ("day", "count", "freedom"):
         if getattr(findings, name) <= 0:
             raise ValueError(f"{where}: {name} = {shown(getattr(findings, name))} must be above 0.")

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.missing.joint_fit import Start, moved_last
-from sysid.verdict.agreement import interval_of_sum
 from sysid.verdict.forms import forms_of
 from sysid.verdict.found import LARGEST, ROUNDS, WEIGHED, Candidate, PairScan, Search
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
@@ -166,7 +165,7 @@ def _weighed(asked: Asked, members: Sequence[Candidate], rivals: Sequence[Sequen
     numbers = TriedSet(
         tuple(one.effect for one in fit.hypotheses), tuple(one.key for one in fit.hypotheses), tuple(fit.q.tolist()),
         asked.base.cost - fit.cost, tuple(p) if len(p) > 1 else (members[0].p,),
-        _left(asked, fit.residual), tuple(gain for gain, _ in own), tuple(interval_of_sum(each)[0] for _, each in own),
+        _left(asked, fit.residual), tuple(gain for gain, _ in own), tuple(tuple(each.tolist()) for _, each in own),
         bent,
         tuple(tuple(class_of(asked, one, each)) for one, each in zip(members, rivals, strict=True)))
     return Weighed(numbers, tuple(members), tuple(rivals), together)

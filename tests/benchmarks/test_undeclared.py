@@ -341,7 +341,7 @@ def test_how_long_a_loop_takes_is_told_of_the_device_that_it_ran_on(tmp_path, de
 @pytest.mark.quick
 def test_evidence_that_was_kept_is_judged_again(tmp_path):
     left = Left(0.0, 0.0, 0.0)
-    one = TriedSet(("slope",), ("slope",), (1.0,), 900.0, (1e-9,), left, (900.0,), (900.0,), left, (("slope",),))
+    one = TriedSet(("slope",), ("slope",), (1.0,), 900.0, (1e-9,), left, (900.0,), ((900.0,),), left, (("slope",),))
     kept = as_json(Findings(1.0, 1e-9, 1.0, 900.0, 9, 0.05, 8.0, 0.0, (one,)))
     verdict = {"verdict": "unexplained", "share": 0.1, "effects": [], "excess": [1.0, 1.0], "findings": kept}
     judged(tmp_path, "slope_x4_0", verdict, {"slope": 0.1})

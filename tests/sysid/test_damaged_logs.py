@@ -168,12 +168,13 @@ def test_the_damaged_motion_beside_a_fit(run):
 
 
 SOME = {"excess": 0.4, "common": 0.3, "smooth": 90.0}
-EVIDENCE = {"schema": 1, "kind": "sysid-evidence", "excess": 0.9, "p_scan": 1e-6, "p_pairs": 0.2, "p_refit": 1e-5,
+EVIDENCE = {"schema": 2, "kind": "sysid-evidence", "excess": 0.9, "p_scan": 1e-6, "p_pairs": 0.2, "p_refit": 1e-5,
             "count": 4000.0, "trials": 12, "day": 0.05, "freedom": 12.0, "usual": 3.0, "noise": ["gyro"],
             "against": {"slope+wind": ["it is not foretold"]}, "sets": [
                 {"effects": ["slope", "wind"], "variants": ["slope", "wind"], "coordinates": [0.1, 0.2], "gain": 900.0,
-                 "p": [1e-6, 1e-4], "p_value": 1e-6, "left": SOME, "own": [700.0, 100.0], "foretold": [300.0, 20.0],
-                 "bent": SOME, "classes": [["slope"], ["wind", "slope"]]}]}  # fmt: skip
+                 "p": [1e-6, 1e-4], "p_value": 1e-6, "left": SOME, "own": [700.0, 100.0],
+                 "foretold": [[300.0], [25.0, -5.0]], "bent": SOME,
+                 "classes": [["slope"], ["wind", "slope"]]}]}  # fmt: skip
 
 
 def test_damaged_evidence_of_a_verdict(tmp_path):

@@ -29,7 +29,7 @@ from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import foretold
 from sysid.verdict.found import Scan
-from sysid.verdict.posterior import Findings, Left, Thresholds, TriedSet, posterior, read, write
+from sysid.verdict.posterior import Findings, Left, Thresholds, TriedSet, as_json, from_json, posterior, read, write
 from sysid.verdict.preparation import as_shown
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import imitation
@@ -120,9 +120,9 @@ def test_an_effect_is_held_against_what_it_leaves_though_it_could_be_predicted(s
 
 
 def tried(excess, p=1e-6, effects=("quadratic_drag",), gain=1.0, bent=0.0, own=None, smooth=0.0):
-    left, size = Left(excess, excess, smooth), len(effects)
-    return TriedSet(effects, effects, (1.0,) * size, gain, (p,) * size, left, own or (gain,) * size,
-                    own or (gain,) * size, Left(bent, bent, 0.0), tuple((name,) for name in effects))
+    left, own = Left(excess, excess, smooth), own or (gain,) * len(effects)
+    return TriedSet(effects, effects, (1.0,) * len(effects), gain, (p,) * len(effects), left, own,
+                    tuple((one,) for one in own), Left(bent, bent, 0.0), tuple((name,) for name in effects))
 
 
 def findings(excess, sets):
@@ -193,11 +193,25 @@ def test_a_further_effect_must_do_more_than_to_mend_the_form_of_the_others():
 
 
 @pytest.mark.quick
-def test_the_smaller_of_two_effects_must_be_foretold_by_other_manoeuvres():
+def test_the_smaller_of_two_effects_must_be_borne_out_by_manoeuvres_and_contradicted_by_none():
     first, both = tried(8.0, gain=200.0, bent=8.0), ("quadratic_drag", "slope")
     pair = replace(tried(0.0, effects=both, gain=280.0, own=(200.0, 90.0)), bent=Left(5.0, 5.0, 0.0))
-    for raised, names in (((30.0, 9.0), 2), ((-3.0, 9.0), 2), ((30.0, -1.0), 1)):
+    odds = -np.log(Thresholds().alpha)
+    for raised, names in ((((30.0,), (9.0,)), 2), (((-3.0,), (9.0,)), 2), (((30.0,), (-1.0,)), 1),
+                          (((30.0,), (50.0, 0.1 - odds)), 2), (((30.0,), (50.0, -0.1 - odds)), 1)):
         given = findings(28.0, [first, replace(pair, foretold=raised)])
+        assert len(given.sets[posterior(given, Thresholds()).chosen].effects) == names
+
+
+@pytest.mark.quick
+def test_evidence_of_an_earlier_number_is_judged_as_it_was():
+    first, both = tried(8.0, gain=200.0, bent=8.0), ("quadratic_drag", "slope")
+    for end, names in ((9.0, 2), (-1.0, 1)):  # of the 95 % interval, which such a file has of each effect
+        pair = replace(tried(0.0, effects=both, gain=280.0, own=(200.0, 90.0)), bent=Left(5.0, 5.0, 0.0))
+        content = json.loads(json.dumps(as_json(findings(28.0, [first, pair]))))
+        ends = ([30.0], [30.0, end])
+        earlier = [{**one, "foretold": of_both} for one, of_both in zip(content["sets"], ends, strict=True)]
+        given = from_json({**content, "schema": 1, "sets": earlier})
         assert len(given.sets[posterior(given, Thresholds()).chosen].effects) == names
 
 

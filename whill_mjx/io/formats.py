@@ -37,7 +37,7 @@ FORMATS = {one.kind: one for one in (
     Format("dreamer-onnx-policy", "policy.json", 1, "an agent of any observations ([fields](policy_file.md))"),
     Format("sysid-report", "report.json", 1, "a fit ([entries](#what-the-two-reportjson-hold))"),
     Format("sysid-close-loop", "report.json", 1, "a closed loop ([entries](#what-the-two-reportjson-hold))"),
-    Format("sysid-evidence", "evidence.json", 1, "evidence of a verdict (fields: `sysid.verdict.posterior.Findings`)"),
+    Format("sysid-evidence", "evidence.json", 2, "evidence of a verdict (fields: `sysid.verdict.posterior.Findings`)"),
     Format("sysid-paper", "paper.json", 1, "the paper's experiment"),
     Format("sysid-searches", "searches.json", 1, "a comparison of searches"),
     Format("sysid-inspection", "inspect.json", 1, "an inspected log (fields: `sysid.logs.inspection.inspect`)"),
@@ -45,8 +45,21 @@ FORMATS = {one.kind: one for one in (
     Format("dreamer-checkpoint", "checkpoints/*/meta.json", 1, "a state of a training, to go on from"),
 )}  # fmt: skip
 """All formats with a number, by kind."""
-MIGRATIONS: dict[str, dict[int, Callable[[Content], Content]]] = {}
-"""Kind -> number -> function that makes the content of the next number of it. None was needed so far."""
+
+
+def _by_manoeuvre(content: Content) -> Content:
+    """Evidence of number 2, which has what every manoeuvre foretells, of number 1, which has the sum's lower end."""
+    sets = content.get("sets")
+    if not isinstance(sets, list):
+        return content
+    return {**content, "sets": [
+        {**one, "foretold": [[gain] for gain in one["foretold"]]}
+        if isinstance(one, dict) and isinstance(one.get("foretold"), list) else one for one in sets
+    ]}
+
+
+MIGRATIONS: dict[str, dict[int, Callable[[Content], Content]]] = {"sysid-evidence": {1: _by_manoeuvre}}
+"""Kind -> number -> function that makes the content of the next number of it."""
 
 
 def upgraded(kind: str, content: Content) -> Content:
