@@ -9,12 +9,10 @@ from scipy import stats
 
 from sysid.missing.joint_fit import Refit, Start
 from sysid.missing.unexplained import held_back_gains
-from sysid.verdict.agreement import interval_of_sum, with_prior
+from sysid.verdict.agreement import errors_of_sizes, half_width, interval_of_sum
 from sysid.verdict.result import Result
 from sysid.verdict.vehicles import refitter_of
 
-CONFIDENCE = 0.95
-FOLLOWED = 0.9  # largest share of a direction's information in one manoeuvre with which its residual is enlarged
 NEARLY = 0.9  # share of the largest size that is looked for from which a size is at its end
 MOVED = 0.01  # p-value of how far base parameters went, below which they went further than from day to day
 LAW = ("speed", "yaw rate", "size of the step")  # by which effects that act at the same times differ
@@ -124,8 +122,7 @@ def beside_still_base(result: Result, iterations: int = 8) -> list[Refit]:
 
 def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
     """Ends (k,), (k,) of the coordinates' confidence intervals."""
-    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, max(len(result.evidence.groups) - 1, 1))
-    reach = quantile * deviations(final, result)
+    reach = half_width(result.evidence.groups) * deviations(final, result)
     axes = [axis for one in final.hypotheses for axis in one.axes]
     ends = np.stack([final.q - reach, final.q + reach])
     factors = np.array([[axis.open[end] for axis in axes] for end in (0, 1)]).reshape(2, -1)
@@ -134,19 +131,7 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
 
 
 def deviations(final: Refit, result: Result) -> np.ndarray:
-    """(k,) standard errors of the coordinates: from whole manoeuvres, which a wrong form pulls each its own way, and
-    what the coordinates seem to be on days without the effect. What a manoeuvre leaves is enlarged by how far the fit
-    followed it (bias-reduced linearisation, Bell and McCaffrey 2002)."""
-    groups = result.evidence.groups
-    matrix, size = with_prior(final, result.evidence.precision), len(final.u)
-    root = np.linalg.inv(np.linalg.cholesky(matrix))
-    moved = []
-    for group in groups:
-        flat = final.jacobian[list(group)].reshape(-1, len(matrix))
-        shares, along = np.linalg.eigh(root @ flat.T @ flat @ root.T)
-        score = along.T @ (root @ (flat.T @ final.residual[list(group)].reshape(-1)))
-        moved.append(root.T @ (along @ (score / np.sqrt(1 - np.clip(shares, 0.0, FOLLOWED)))))
-    variance = np.maximum(np.diag(root.T @ root), np.square(moved).sum(0))[size:]
+    """(k,) standard errors of the coordinates (`errors_of_sizes`)."""
     wander = [np.diag(result.prepared.wander.at(result.evidence.columns, result.hypotheses.index(one), q))
               for one, q in zip(final.hypotheses, final.split, strict=True)]
-    return np.asarray(np.sqrt(variance + np.concatenate([[], *wander])))
+    return errors_of_sizes(final, result.evidence.groups, result.evidence.precision, np.concatenate([[], *wander]))

@@ -43,6 +43,7 @@ from sysid.pages.loop_words import shifts, summary
 from sysid.pages.report import code_hashes, error_rows, write_report
 from sysid.pages.series import replayed
 from sysid.pages.verdict_picture import account
+from sysid.verdict import agreement
 from sysid.verdict.posterior import write as write_evidence
 from sysid.verdict.result import LoopConfig, Result
 from sysid.verdict.vehicles import fitted_after, fitted_alone, fitted_before
@@ -133,7 +134,7 @@ def effects(result: Result) -> list[dict[str, Any]]:
                 "parameters": {axis.parameter: {
                     "value": values[axis.parameter],
                     **in_range(axis.parameter, values[axis.parameter], [end[axis.parameter] for end in ends]),
-                    "confidence": trust.CONFIDENCE, "unit": about_of(axis.parameter).unit,
+                    "confidence": agreement.CONFIDENCE, "unit": about_of(axis.parameter).unit,
                     "was": was.get(axis.parameter), "neutral": about_of(axis.parameter).neutral,
                     "description": about_of(axis.parameter).description} for axis in one.axes},
                 "p_value": named.p,
@@ -219,7 +220,7 @@ def write_run(out: Path, result: Result, report: dict[str, Any]) -> None:
 
 def narrower(interval: Sequence[float], value: float) -> tuple[float, float]:
     """The interval of a vehicle file, all of which are read as of CONFIDENCE, of an interval of the report."""
-    share = norm.ppf((1 + CONFIDENCE) / 2) / norm.ppf((1 + trust.CONFIDENCE) / 2)
+    share = norm.ppf((1 + CONFIDENCE) / 2) / norm.ppf((1 + agreement.CONFIDENCE) / 2)
     low, high = (value + share * (end - value) for end in interval)
     return float(low), float(high)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+from scipy import special, stats
 
 from sysid.missing.joint_fit import Refit
 
@@ -14,6 +14,8 @@ ALPHA = 0.05  # of the test whether manoeuvres differ on a size
 POWER = 0.8  # least power of a manoeuvre to separate an effect from none, to be asked; and of that test
 SCATTER = 0.5  # standard deviation from manoeuvre to manoeuvre, as a share of the size, that the test should see
 RESAMPLES = 2000
+CONFIDENCE = 0.95
+FOLLOWED = 0.9  # largest share of a direction's information in one manoeuvre with which its residual is enlarged
 RIDGE = 1e-9
 
 
@@ -64,6 +66,29 @@ def interval_of_sum(values: np.ndarray, seed: int = 0) -> tuple[float, float]:
     sums = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].sum(1)
     low, high = np.quantile(sums, [0.025, 0.975])
     return float(low), float(high)
+
+
+def errors_of_sizes(
+    fit: Refit, groups: Sequence[Sequence[int]], precision: np.ndarray, wander: np.ndarray
+) -> np.ndarray:
+    """(k,) standard errors of the coordinates: from whole manoeuvres, which a wrong form pulls each its own way, and
+    `wander` (k,), the variance of what they seem to be on days without the effects. What a manoeuvre leaves is enlarged
+    by how far the fit followed it (bias-reduced linearisation, Bell and McCaffrey 2002)."""
+    matrix, size = with_prior(fit, precision), len(fit.u)
+    root = np.linalg.inv(np.linalg.cholesky(matrix))
+    moved = []
+    for group in groups:
+        flat = fit.jacobian[list(group)].reshape(-1, len(matrix))
+        shares, along = np.linalg.eigh(root @ flat.T @ flat @ root.T)
+        score = along.T @ (root @ (flat.T @ fit.residual[list(group)].reshape(-1)))
+        moved.append(root.T @ (along @ (score / np.sqrt(1 - np.clip(shares, 0.0, FOLLOWED)))))
+    variance = np.maximum(np.diag(root.T @ root), np.square(moved).sum(0))[size:]
+    return np.asarray(np.sqrt(variance + wander))
+
+
+def half_width(groups: Sequence[Sequence[int]]) -> float:
+    """Standard errors from a size to the ends of its 95 % interval, which rests on so many manoeuvres."""
+    return float(stats.t.ppf((1 + CONFIDENCE) / 2, max(len(groups) - 1, 1)))
 
 
 def with_prior(fit: Refit, precision: np.ndarray) -> np.ndarray:

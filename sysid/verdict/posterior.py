@@ -76,6 +76,8 @@ class TriedSet:
     """By how much each effect so raises the log density of each manoeuvre, as the others predict it."""
     bent: Left  # what is left where all may have other forms
     classes: tuple[tuple[str, ...], ...]  # each effect with those not separated from it, nearest first
+    surely: tuple[float, ...] = ()
+    """Of each effect: its size furthest from absence, in half widths of its 95 % interval. Older files have none."""
 
     def apart(self) -> list[list[str]]:
         """The classes, each without what is named beside it."""
@@ -150,10 +152,13 @@ class Findings:
     def borne_out(self, one: TriedSet, priors: Thresholds) -> bool:
         """Whether manoeuvres bear out every effect but the largest, whose size the others gave: together they raise the
         log density, and none lowers it by as much as the prior odds. Against a true effect, one does so with a
-        probability of `alpha` at most, as with any ratio of likelihoods."""
+        probability of `alpha` at most, as with any ratio of likelihoods. And some 95 % interval of its sizes must leave
+        out absence."""
         largest = max(range(len(one.own)), key=lambda place: one.own[place])
-        smaller = [gains for place, gains in enumerate(one.foretold) if place != largest]
-        return all(sum(gains) > 0 and self.log_weight(-2 * min(gains), 1, priors) < 0 for gains in smaller)
+        smaller = [place for place in range(len(one.own)) if place != largest]
+        return all(
+            sum(one.foretold[place]) > 0 and self.log_weight(-2 * min(one.foretold[place]), 1, priors) < 0
+            and (not one.surely or one.surely[place] > 1) for place in smaller)
 
     def log_weight(self, gain: float, effects: int, priors: Thresholds) -> float:
         """Of an explanation: what it gains, in units of what days differ by, less log(1 / alpha) for each effect."""
@@ -255,10 +260,11 @@ def from_json(content: dict[str, Any], where: str = "findings") -> Findings:
         known["sets"] = [_of(TriedSet, one) if isinstance(one, dict) else one for one in sets]
     findings = record(where, Findings, known)
     for index, one in enumerate(findings.sets):
-        lengths = {len(each) for each in (one.effects, one.variants, one.p, one.own, one.foretold, one.classes)}
+        lists = (one.effects, one.variants, one.p, one.own, one.foretold, one.classes, one.surely or one.own)
+        lengths = {len(each) for each in lists}
         if len(lengths) != 1 or 0 in lengths or not all(one.classes) or not all(one.foretold):
-            raise ValueError(f"{where}: sets[{index}]: effects, variants, p, own, foretold and classes must be of one "
-                             "length, above 0, and so must the members of foretold and classes.")
+            raise ValueError(f"{where}: sets[{index}]: effects, variants, p, own, foretold, classes and surely must be "
+                             "of one length, above 0, and so must the members of foretold and classes.")
     for name in ("day", "count", "freedom"):
         if getattr(findings, name) <= 0:
             raise ValueError(f"{where}: {name} = {shown(getattr(findings, name))} must be above 0.")

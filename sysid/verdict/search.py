@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.missing.joint_fit import Start, moved_last
+from sysid.missing.joint_fit import Refit, Start, moved_last
+from sysid.verdict.agreement import errors_of_sizes, half_width
 from sysid.verdict.forms import forms_of
 from sysid.verdict.found import LARGEST, ROUNDS, WEIGHED, Candidate, PairScan, Search
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
@@ -167,8 +168,19 @@ def _weighed(asked: Asked, members: Sequence[Candidate], rivals: Sequence[Sequen
         asked.base.cost - fit.cost, tuple(p) if len(p) > 1 else (members[0].p,),
         _left(asked, fit.residual), tuple(gain for gain, _ in own), tuple(tuple(each.tolist()) for _, each in own),
         bent,
-        tuple(tuple(class_of(asked, one, each)) for one, each in zip(members, rivals, strict=True)))
+        tuple(tuple(class_of(asked, one, each)) for one, each in zip(members, rivals, strict=True)),
+        tuple(_surely(asked, fit)))
     return Weighed(numbers, tuple(members), tuple(rivals), together)
+
+
+def _surely(asked: Asked, fit: Refit) -> list[float]:
+    """Of each effect of a joint fit: its size that is furthest from absence, in half widths of its 95 % interval."""
+    evidence = asked.evidence
+    wander = [np.diag(asked.wander.at(evidence.columns, asked.hypotheses.index(one), q))
+              for one, q in zip(fit.hypotheses, fit.split, strict=True)]
+    errors = errors_of_sizes(fit, evidence.groups, asked.refitter.precision, np.concatenate(wander))
+    away = np.abs(fit.q) / (half_width(evidence.groups) * np.maximum(errors, 1e-12))
+    return [float(away[part].max()) for part in fit.parts]
 
 
 def _left(asked: Asked, residual: np.ndarray) -> Left:

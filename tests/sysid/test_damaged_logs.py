@@ -173,7 +173,7 @@ EVIDENCE = {"schema": 2, "kind": "sysid-evidence", "excess": 0.9, "p_scan": 1e-6
             "against": {"slope+wind": ["it is not foretold"]}, "sets": [
                 {"effects": ["slope", "wind"], "variants": ["slope", "wind"], "coordinates": [0.1, 0.2], "gain": 900.0,
                  "p": [1e-6, 1e-4], "p_value": 1e-6, "left": SOME, "own": [700.0, 100.0],
-                 "foretold": [[300.0], [25.0, -5.0]], "bent": SOME,
+                 "foretold": [[300.0], [25.0, -5.0]], "surely": [4.0, 1.5], "bent": SOME,
                  "classes": [["slope"], ["wind", "slope"]]}]}  # fmt: skip
 
 

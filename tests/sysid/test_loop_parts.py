@@ -204,6 +204,15 @@ def test_the_smaller_of_two_effects_must_be_borne_out_by_manoeuvres_and_contradi
 
 
 @pytest.mark.quick
+def test_the_smaller_of_two_effects_is_not_named_where_it_may_as_well_be_absent():
+    first, both = tried(8.0, gain=200.0, bent=8.0), ("quadratic_drag", "slope")
+    pair = replace(tried(0.0, effects=both, gain=280.0, own=(200.0, 90.0)), bent=Left(5.0, 5.0, 0.0))
+    for surely, names in (((3.0, 0.9), 1), ((3.0, 1.1), 2), ((0.9, 1.1), 2)):
+        given = findings(28.0, [first, replace(pair, surely=surely)])
+        assert len(given.sets[posterior(given, Thresholds()).chosen].effects) == names
+
+
+@pytest.mark.quick
 def test_evidence_of_an_earlier_number_is_judged_as_it_was():
     first, both = tried(8.0, gain=200.0, bent=8.0), ("quadratic_drag", "slope")
     for end, names in ((9.0, 2), (-1.0, 1)):  # of the 95 % interval, which such a file has of each effect
