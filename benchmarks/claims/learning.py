@@ -371,7 +371,7 @@ CLAIMS = (
         "Seconds until something happens",
         "speed",
         "Fresh processes: the first finds no compiled programs, the others what it left, with another seed. "
-        "The host did other work beside them. [What compilation waited for](notes/compilation.md) is told apart.",
+        "The host did other work beside them. A note shows [where compilation spends its time](notes/compilation.md).",
         ("what", "cold [s]", "warm [s]"),
         (
             ("first step of a training (obstacle course), one GPU", "{first_step_cold_s}", "{first_step_warm_s}"),

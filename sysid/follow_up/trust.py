@@ -132,6 +132,7 @@ def intervals(final: Refit, result: Result) -> tuple[np.ndarray, np.ndarray]:
 
 def deviations(final: Refit, result: Result) -> np.ndarray:
     """(k,) standard errors of the coordinates (`errors_of_sizes`)."""
-    wander = [np.diag(result.prepared.wander.at(result.evidence.columns, result.hypotheses.index(one), q))
-              for one, q in zip(final.hypotheses, final.split, strict=True)]
-    return errors_of_sizes(final, result.evidence.groups, result.evidence.precision, np.concatenate([[], *wander]))
+    evidence = result.evidence
+    numbers = [result.hypotheses.index(one) for one in final.hypotheses]
+    variance = result.prepared.wander.variances(evidence.columns, numbers, final.split)
+    return errors_of_sizes(final, evidence.groups, evidence.precision, variance)

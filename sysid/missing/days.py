@@ -150,6 +150,11 @@ class Wander:
         mine = [i for i, one in enumerate(columns) if one.hypothesis == hypothesis]
         return self.covariance[min(mine, key=lambda i: abs(columns[i].level - float(np.abs(q).max())))]
 
+    def variances(self, columns: Sequence[Columns], numbers: Sequence[int], split: Sequence[np.ndarray]) -> np.ndarray:
+        """(k,) variance of the coordinates, all of them in turn, of hypotheses with these numbers near `split`."""
+        each = [np.diag(self.at(columns, number, q)) for number, q in zip(numbers, split, strict=True)]
+        return np.concatenate([[], *each])
+
     def draw_shares(self, draws: int, rng: np.random.Generator) -> np.ndarray:
         """(N, D) of each reference day's apparent effects in simulated days, heavy-tailed as few days ask for."""
         days = len(self.shapes[0])

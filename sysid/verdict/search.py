@@ -176,9 +176,9 @@ def _weighed(asked: Asked, members: Sequence[Candidate], rivals: Sequence[Sequen
 def _surely(asked: Asked, fit: Refit) -> list[float]:
     """Of each effect of a joint fit: its size that is furthest from absence, in half widths of its 95 % interval."""
     evidence = asked.evidence
-    wander = [np.diag(asked.wander.at(evidence.columns, asked.hypotheses.index(one), q))
-              for one, q in zip(fit.hypotheses, fit.split, strict=True)]
-    errors = errors_of_sizes(fit, evidence.groups, asked.refitter.precision, np.concatenate(wander))
+    numbers = [asked.hypotheses.index(one) for one in fit.hypotheses]
+    variance = asked.wander.variances(evidence.columns, numbers, fit.split)
+    errors = errors_of_sizes(fit, evidence.groups, asked.refitter.precision, variance)
     away = np.abs(fit.q) / (half_width(evidence.groups) * np.maximum(errors, 1e-12))
     return [float(away[part].max()) for part in fit.parts]
 
