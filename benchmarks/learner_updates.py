@@ -14,6 +14,7 @@ from dreamer import agent as agents
 from dreamer import replay, seeds
 from dreamer.config import DreamerConfig
 from dreamer.host_replay import HostFrames
+from dreamer.programs import compile_lowered
 from dreamer.replay import Replay
 
 OBS_SHAPE = (64, 64, 3)
@@ -94,7 +95,7 @@ class Updates:
     def compile(self) -> float:
         """Seconds it took."""
         start = time.perf_counter()
-        self.program = self._lowered.compile()
+        self.program = compile_lowered(self._lowered)
         return time.perf_counter() - start
 
     def run(self) -> tuple[float, float]:

@@ -12,12 +12,12 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
 
 from dreamer import checkpoint, host_replay, parallel, pretrain, replay, seeds
 from dreamer.config import DreamerConfig
 from dreamer.iteration import TrainState, compile_init
 from dreamer.metrics_log import write_atomically
+from dreamer.programs import Place, compiled
 from dreamer.types import FunctionalEnv
 
 
@@ -37,18 +37,19 @@ def check_seed(out: Path, seed: int | Sequence[int], resume: bool) -> None:
 
 
 def first_state(
-    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int | Sequence[int], resume: bool, mesh: Mesh | None
+    env: FunctionalEnv, config: DreamerConfig, out: Path, seed: int | Sequence[int], resume: bool, place: Place
 ) -> tuple[TrainState, float]:
     """State to start from and the time [s] already spent."""
+    mesh = place.mesh
     if resume and checkpoint.complete(out / "checkpoints"):
-        template = _init(env, config, seed, None, split=mesh is not None)()
+        template = _init(env, config, seed, Place(None, place.kept), split=mesh is not None)()
         restored = checkpoint.restore(out / "checkpoints", host_replay.revealed(template), config)
         if restored is not None:
             state = host_replay.hidden(restored[0], template)
             if mesh is not None:
                 state = parallel.place(state, parallel.state_shardings(mesh, state, env.num_envs))
             return state, float(restored[1]["wall_s"])
-    state = _init(env, config, seed, mesh)()
+    state = _init(env, config, seed, place)()
     if not parallel.is_first_process():
         return state, 0.0
     if not resume:
@@ -59,13 +60,16 @@ def first_state(
 
 
 def _init(
-    env: FunctionalEnv, config: DreamerConfig, seed: int | Sequence[int], mesh: Mesh | None, split: bool = False
+    env: FunctionalEnv, config: DreamerConfig, seed: int | Sequence[int], place: Place, split: bool = False
 ) -> Any:
     """The compiled first state, () -> state; `split`: it will be placed on several devices."""
-    alone = isinstance(seed, int) and mesh is None and not split
+    alone = isinstance(seed, int) and place.mesh is None and not split
     config = replace(config, replay_memory=_memory(env, config, alone))
     if isinstance(seed, int):
-        return compile_init(env, config, seed, mesh)
+        init = compile_init(env, config, seed, place.mesh)
+        if place.kept is None:
+            return init
+        return functools.partial(compiled("init_state", lambda: init.func.lower(*init.args), place.kept), *init.args)
     return functools.partial(jax.jit(lambda each: seeds.init_states(env, config, each)), np.asarray(seed, np.int32))
 
 

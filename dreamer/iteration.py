@@ -19,6 +19,7 @@ from dreamer import exploration, parallel, replay, sensors, spaces
 from dreamer.agent import AgentState
 from dreamer.config import LEAST_TRAIN_RATIO, DreamerConfig
 from dreamer.host_replay import HostFrames
+from dreamer.programs import compile_lowered
 from dreamer.replay import Batch, Replay
 from dreamer.rssm import Latent
 from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
@@ -263,7 +264,8 @@ def compile_iteration(
     env: FunctionalEnv, config: DreamerConfig, state: TrainState, mesh: Mesh | None = None, step: Any = train_iteration
 ) -> Any:
     """The compiled iteration, state -> (state, metrics), with the state donated; of `step`, if another one is meant."""
-    return lower_iteration(env, config, state, mesh, step).compile()
+    lowered = lower_iteration(env, config, state, mesh, step)
+    return compile_lowered(lowered) if mesh is None else lowered.compile()
 
 
 def lower_iteration(

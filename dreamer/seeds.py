@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from dreamer.config import DreamerConfig
 from dreamer.iteration import Metrics, TrainState, init_state, train_iteration
+from dreamer.programs import compile_lowered
 from dreamer.types import FunctionalEnv, Params
 
 SHARED = (
@@ -69,7 +70,7 @@ def compile_iterations(
     env: FunctionalEnv, config: DreamerConfig, state: TrainState, step: Any = train_iteration
 ) -> Callable[[TrainState], Any]:
     """The compiled `train_iterations`, with the state donated."""
-    return _iterations(env, config, step).lower(state).compile()
+    return compile_lowered(_iterations(env, config, step).lower(state))
 
 
 @lru_cache(maxsize=8)

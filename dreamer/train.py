@@ -6,7 +6,7 @@ import functools
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol
@@ -30,6 +30,7 @@ from dreamer.iteration import (
     train_iteration,
 )
 from dreamer.metrics_log import Log, Meter, MetricsFn, evaluated, headline
+from dreamer.programs import Place, Programs, compiled, in_thread
 from dreamer.progress import Progress
 from dreamer.types import FunctionalEnv, Params
 
@@ -112,6 +113,9 @@ class TrainingOptions:
     """Over which instances and batches are split, those of all processes; none takes the first one."""
     tensorboard: bool = False
     """Write the logged lines to OUT/tensorboard too."""
+    kept: Programs | None = None
+    """Where compiled programs are kept for later runs with the same environment and configuration. For one seed on one
+    device with the replay in its memory; other trainings leave it unused."""
     announce: Callable[[str], None] = lambda text: None
     """Gets a line when something begins that takes long: compilation, the training, the last checkpoint."""
 
@@ -199,24 +203,21 @@ class _Run:
         """Restore or make the state, and compile the program of an iteration."""
         options, self._began = self.options, time.monotonic()
         options.announce("preparing the training: first worlds and parameters")
-        early = self._compiled_ahead(seed, mesh)
-        self.state, self._wall_before = first_state(self.env, self.config, self.out, seed, options.resume, mesh)
+        self._several = not isinstance(seed, int)
+        alone = not self._several and mesh is None and self._on_device()
+        self._place = Place(mesh, options.kept if alone else None)
+        early = self._compiled_ahead(seed) if alone and isinstance(seed, int) else None
+        self.state, self._wall_before = first_state(self.env, self.config, self.out, seed, options.resume, self._place)
         self.env_steps = int(self.state.env_steps)
         self._done = pretrain.counters(self.state)
         place = pretrain.position(self.config, {"env_steps": self.env_steps, **self._done})
         self._counted = place >= 0  # all pretraining is done
         self._log = Log(self.out / "metrics.jsonl", self.config, place, options.on_metrics, options.tensorboard)
 
-        def compiled(step: Any) -> Any:
-            if isinstance(seed, int):
-                return compile_iteration(self.env, self.config, self.state, mesh, step)
-            return seeds.compile_iterations(self.env, self.config, self.state, step)
-
-        self._compiled = compiled
         self._ahead = options.eval_ahead if mesh is None else None
         options.announce(COMPILING)
         step = train_iteration if self._counted else pretrain.pretrain_iteration
-        self._iterate = compiled(step) if early is None else early.result()
+        self._iterate = self._program(step) if early is None else early.result()
         options.announce(f"training; its program was ready after {time.monotonic() - self._began:.0f} s")
         self._bar = Progress(self.total_steps, self.env_steps, options.progress and parallel.is_first_process())
         self._meter = Meter()
@@ -224,20 +225,41 @@ class _Run:
         self._pace = checkpoint.Pace(options.checkpoint_every_s)
         self._evaluated = self.env_steps // options.eval_every
 
-    def _compiled_ahead(self, seed: int | Sequence[int], mesh: Mesh | None) -> Future | None:
-        """The program of an iteration, compiled while the first state is made.
+    def _program(self, step: Any) -> Any:
+        """The compiled `step`, state -> (state, metrics), for the state that there is."""
+        if self._several:
+            return seeds.compile_iterations(self.env, self.config, self.state, step)
+        if self._place.mesh is not None:
+            return compile_iteration(self.env, self.config, self.state, self._place.mesh, step)
 
-        None where that state comes first: one to go on from may be refused, memory of the host is part of its program.
+        def lower() -> jax.stages.Lowered:
+            return lower_iteration(self.env, self.config, self.state, step=step)
+
+        return compiled(step.__name__, lower, self._place.kept)
+
+    def _compiled_ahead(self, seed: int) -> Future | None:
+        """The program of an iteration, read or compiled while the first state is made.
+
+        None where that state comes first: one to go on from may be refused.
         """
-        resumed = self.options.resume and checkpoint.complete(self.out / "checkpoints")
-        if not isinstance(seed, int) or mesh is not None or self.config.pretrain_steps or resumed:
+        name, kept, config = train_iteration.__name__, self._place.kept, replace(self.config, replay_memory="device")
+        if self.config.pretrain_steps:
             return None
+
+        def lower() -> jax.stages.Lowered:
+            return lower_iteration(self.env, config, jax.eval_shape(compile_init(self.env, config, seed)))
+
+        if kept is not None and name in kept:
+            return in_thread(compiled, name, lower, kept)
+        if self.options.resume and checkpoint.complete(self.out / "checkpoints"):
+            return None
+        lowered = lower()  # in this thread: the first state needs some of what is traced here
+        return in_thread(compiled, name, lambda: lowered, kept)
+
+    def _on_device(self) -> bool:
+        """Whether the replay's observations fit into the device's memory, and may be there."""
         where = self.config.replay_memory
-        if where == "host" or (where == "auto" and not fits(self.env, self.config)):
-            return None
-        config = replace(self.config, replay_memory="device")
-        shapes = jax.eval_shape(compile_init(self.env, config, seed))
-        return in_thread(lower_iteration(self.env, self.config, shapes).compile)
+        return where == "device" or (where == "auto" and fits(self.env, self.config))
 
     def go_on(self) -> None:
         """Iterate to the end."""
@@ -251,7 +273,7 @@ class _Run:
             if begins:
                 self._counted = True
                 over = finished or self._stopped
-                self._iterate = self._iterate if over else self._compiled(train_iteration)
+                self._iterate = self._iterate if over else self._program(train_iteration)
 
     def interrupted(self) -> None:
         """Keep what is done."""
@@ -365,14 +387,6 @@ class _Run:
 def copied(params: Params) -> Params:
     """Arrays of their own; one program copies them all."""
     return jax.tree.map(jnp.copy, params)
-
-
-def in_thread(call: Callable[..., Any], *given: Any) -> Future:
-    """A call beside what follows. XLA compiles without holding Python's lock; arrays must not be donated meanwhile."""
-    threads = ThreadPoolExecutor(1)
-    started = threads.submit(call, *given)
-    threads.shutdown(wait=False)
-    return started
 
 
 if __name__ == "__main__":

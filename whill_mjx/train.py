@@ -23,6 +23,11 @@ if starts(__name__):
 
 import jax
 
+if starts(__name__):
+    from whill_mjx.devices import wake_gpu
+
+    wake_gpu()
+
 from dreamer import checkpoint, parallel
 from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices, join

@@ -17,6 +17,7 @@ from dreamer_toys import corridor_env, tiny_config  # noqa: E402
 
 from dreamer import iteration, parallel, sensors  # noqa: E402
 from dreamer.first_state import first_state  # noqa: E402
+from dreamer.programs import Place  # noqa: E402
 from dreamer.train import TrainingOptions, train  # noqa: E402
 
 # Learning starts with the last iteration: two updates. Later ones amplify rounding, since the outer bins of a young
@@ -83,7 +84,7 @@ def one_of_two(out, port, index):
     run = dataclasses.replace(QUIET, devices=devices, eval_fn=lambda params, steps: {"x": float(index)})
     result = train(ENV, CONFIG, folder, 72, 0, run)
     mesh = parallel.make_mesh(devices, ENV.num_envs, CONFIG.batch_size)
-    again, _ = first_state(ENV, CONFIG, folder, 0, True, mesh)  # what a second start would go on from
+    again, _ = first_state(ENV, CONFIG, folder, 0, True, Place(mesh))  # what a second start would go on from
     assert len(again.replay.obs.sharding.device_set) == 2 and int(again.env_steps) == 72
     many, restored = (flat(jax.device_get(agent.params)) for agent in (result.agent, again.agent))
     if index == 0:

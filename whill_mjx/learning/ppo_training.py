@@ -13,12 +13,15 @@ import jax
 import numpy as np
 
 from dreamer import checkpoint
+from dreamer.programs import compiled, in_thread
 from dreamer.progress import Progress
-from dreamer.train import COMPILING, TrainingOptions, carry_out, copied, in_thread
+from dreamer.train import COMPILING, TrainingOptions, carry_out, copied
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate
 
+PROGRAM = "ppo_iterate"
+"""Name under which the program of an iteration is kept."""
 SHOWN = ("success", "return")
 """Figures of an evaluation in the progress bar."""
 
@@ -79,16 +82,22 @@ class _Run:
         total = np.int32(self.iterations)
         program = jax.jit(lambda state, total: iterate(self.env, self.config, total, state), donate_argnums=0)
         init = jax.jit(lambda seed: init_state(self.env, self.config, seed))
-        shapes = jax.eval_shape(init, np.int32(seed))
-        early = in_thread(program.lower(shapes, total).compile)  # while the first state is made
-        self.state, self.wall_before = _first_state(init(np.int32(seed)), self.config, self.out)
+        kept, given = options.kept, np.int32(seed)
+
+        def lower() -> jax.stages.Lowered:
+            return program.lower(jax.eval_shape(init, given), total)
+
+        lowered = None if kept is not None and PROGRAM in kept else lower()
+        early = in_thread(compiled, PROGRAM, lambda: lowered or lower(), kept)  # while the first state is made
+        first = compiled("ppo_init", lambda: init.lower(given), kept)(given)
+        self.state, self.wall_before = _first_state(first, self.config, self.out)
         self.done = int(self.state.updates)
         self.logged = self.env_steps // options.eval_every
         _keep_lines(self.out / "metrics.jsonl", self.env_steps)
         options.announce(COMPILING)
         self.ready: list[Any] = []
-        compiled = early.result()
-        self.run = lambda state: compiled(state, total)
+        ready = early.result()
+        self.run = lambda state: ready(state, total)
         options.announce(f"training; its program was ready after {time.monotonic() - self.began:.0f} s")
         self.pace = checkpoint.Pace(options.checkpoint_every_s)
         self.bar = Progress(self.iterations * self.each, self.env_steps, options.progress)

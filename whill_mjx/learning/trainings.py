@@ -17,6 +17,7 @@ from whill_mjx.evaluation.episodes import Course, episode_keys
 from whill_mjx.evaluation.rollouts import rollout
 from whill_mjx.io.heartbeat import say
 from whill_mjx.learning.checks import Evaluate, Stopper, keep_best, mean_figures, read_best
+from whill_mjx.learning.kept import kept_programs
 from whill_mjx.learning.options import TrainOptions
 from whill_mjx.learning.ppo_training import Length, train_ppo
 from whill_mjx.learning.setup import (
@@ -66,6 +67,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
             stop=stopper,
             devices=devices,
             tensorboard=options.tensorboard,
+            kept=kept_programs(preset, options.learner, vehicle),
             announce=stage,
         ),
     )
@@ -97,6 +99,7 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
         eval_every=preset.eval_every,
         checkpoint_every_s=options.checkpoint_every_s,
         stop=stopper,
+        kept=kept_programs(preset, options.learner, vehicle),
         announce=stage,
     )
     length = Length(preset.total_steps, stopper.total_steps(preset.total_steps))

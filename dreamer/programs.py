@@ -1,0 +1,100 @@
+"""How programs are compiled, and compiled programs that are kept whole.
+
+JAX keeps what XLA has compiled by a checksum of the lowered program. So each process traces and lowers it again, which
+takes twice as long as reading it. Here a program is kept by a checksum of what it is made of, and a process that finds
+it traces nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental import serialize_executable
+from jax.sharding import Mesh
+
+CONCURRENT: dict[str, str | bool] = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+"""Kernels that do not wait for each other's results run at the same time."""
+DIGEST = hashlib.sha256().digest_size
+
+
+@dataclass(frozen=True)
+class Programs:
+    """Compiled programs in a folder."""
+
+    folder: Path
+    made_of: str
+    """Hexadecimal checksum of everything that the programs depend on: code, settings, library versions, device."""
+
+    def __contains__(self, name: str) -> bool:
+        return self._path(name).exists()
+
+    def read(self, name: str) -> jax.stages.Compiled | None:
+        """A program; None where it is not there, damaged, or cannot be loaded here."""
+        try:
+            content = self._path(name).read_bytes()
+            if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:
+                return None
+            return serialize_executable.deserialize_and_load(*pickle.loads(content[DIGEST:]))
+        except Exception:  # whatever is wrong with it, it can be compiled
+            return None
+
+    def write(self, name: str, program: jax.stages.Compiled) -> None:
+        """Keep a program; a full disk, or a program that XLA cannot write, costs a compilation next time."""
+        try:
+            content = pickle.dumps(serialize_executable.serialize(program))
+            self.folder.mkdir(parents=True, exist_ok=True)
+            temporary = self.folder / f".{self.made_of}-{name}.{os.getpid()}"
+            temporary.write_bytes(hashlib.sha256(content).digest() + content)
+            os.replace(temporary, self._path(name))
+        except (OSError, ValueError, TypeError, pickle.PicklingError, jax.errors.JaxRuntimeError):
+            return
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{self.made_of}-{name}"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a training's programs run, and where they are kept."""
+
+    mesh: Mesh | None = None
+    """Devices that share the work; None for one."""
+    kept: Programs | None = None
+    """Of a training on one device."""
+
+
+def compiled(name: str, lower: Callable[[], jax.stages.Lowered], kept: Programs | None) -> jax.stages.Compiled:
+    """The kept program of this name, or else what `lower` gives, compiled and kept."""
+    program = None if kept is None else kept.read(name)
+    if program is None:
+        program = compile_lowered(lower())
+        if kept is not None:
+            in_thread(kept.write, name, program)
+    return program
+
+
+def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """A program for one device; on a GPU with `CONCURRENT`, where this version of XLA has the option."""
+    if jax.default_backend() == "gpu":
+        try:
+            return lowered.compile(compiler_options=CONCURRENT)
+        except jax.errors.JaxRuntimeError as error:
+            if "option" not in str(error):
+                raise
+    return lowered.compile()
+
+
+def in_thread(call: Callable[..., Any], *given: Any) -> Future:
+    """A call beside what follows. XLA compiles without holding Python's lock; arrays must not be donated meanwhile."""
+    threads = ThreadPoolExecutor(1)
+    started = threads.submit(call, *given)
+    threads.shutdown(wait=False)
+    return started
