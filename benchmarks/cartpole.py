@@ -29,7 +29,7 @@ from benchmarks.harness import figure, record
 from bridge.options import Parser, in_range, whole
 from dreamer import spaces
 from dreamer.config import DreamerConfig, preset
-from dreamer.evaluate import evaluate
+from dreamer.evaluate import Rounds, evaluate
 from dreamer.train import TrainingOptions, train
 from dreamer.types import FunctionalEnv
 from whill_mjx.io.command_line import guarded
@@ -140,9 +140,8 @@ def train_group(
     out = folder(options, seeds)
 
     def evaluation(params: Any, decisions: int) -> dict[str, float]:
-        result = evaluate(
-            task.test, config, params, jax.random.PRNGKey(77), options.episodes, max_steps=task.max_decisions
-        )
+        key, rounds = jax.random.PRNGKey(77), Rounds(task.max_decisions)
+        result = evaluate(task.test, config, params, key, options.episodes, rounds)
         each = np.atleast_2d(result["return"]).mean(-1)
         text = ", ".join(f"seed {seed} {value:.4g}" for seed, value in zip(seeds, each, strict=True))
         print(f"{decisions * task.repeat} steps, {time.monotonic() - began:.0f} s: return of {text}", flush=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -12,7 +13,18 @@ import numpy as np
 from dreamer import agent as agents
 from dreamer import seeds, spaces
 from dreamer.config import DreamerConfig
+from dreamer.programs import Kept, Programs
 from dreamer.types import FunctionalEnv, Params
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """How episodes are played."""
+
+    max_steps: int = 100_000
+    """A round ends here even if an instance has not finished."""
+    kept: Programs | None = None
+    """Where the compiled program is kept; not for several seeds."""
 
 
 def evaluate(
@@ -21,7 +33,7 @@ def evaluate(
     params: Params,
     key: jax.Array,
     episodes: int,
-    max_steps: int = 100_000,
+    rounds: Rounds = Rounds(),  # noqa: B008
 ) -> dict[str, np.ndarray]:
     """Results of `episodes` episodes.
 
@@ -34,7 +46,7 @@ def evaluate(
         params: of the agent, or of several with a seed axis in front.
         key: consumed; all seeds meet the same starts.
         episodes: how many; rounds of `env.num_envs`, the last one cut to its first instances.
-        max_steps: a round ends here even if an instance has not finished.
+        rounds: how long one lasts at most, and where its program is kept.
 
     Returns:
         Arrays (episodes,), or (S, episodes) of S seeds: return, length [steps], finished, and every metric of the
@@ -45,18 +57,21 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes = {episodes}: it must be at least 1. Pass a positive number.")
-    play = _compiled(env, config, max_steps, bool(seeds.count(params)))
+    several = bool(seeds.count(params))
+    play = _compiled(env, config, rounds, several)
     keys = jax.random.split(key, -(-episodes // env.num_envs))
-    rounds = [jax.device_get(play(params, round_key)) for round_key in keys]
-    return {name: np.concatenate([result[name] for result in rounds], -1)[..., :episodes] for name in rounds[0]}
+    results = [jax.device_get(play(params, round_key)) for round_key in keys]
+    return {name: np.concatenate([result[name] for result in results], -1)[..., :episodes] for name in results[0]}
 
 
 @lru_cache(maxsize=8)
-def _compiled(env: FunctionalEnv, config: DreamerConfig, max_steps: int, several: bool) -> Any:
+def _compiled(env: FunctionalEnv, config: DreamerConfig, rounds: Rounds, several: bool) -> Any:
     def play(params: Params, key: jax.Array) -> dict[str, jax.Array]:
-        return play_round(env, config, params, key, max_steps)
+        return play_round(env, config, params, key, rounds.max_steps)
 
-    return jax.jit(jax.vmap(play, in_axes=(0, None)) if several else play)
+    if several:
+        return jax.jit(jax.vmap(play, in_axes=(0, None)))
+    return Kept(f"evaluate_{rounds.max_steps}", jax.jit(play), rounds.kept)
 
 
 def play_round(

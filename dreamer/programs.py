@@ -23,6 +23,8 @@ from jax.sharding import Mesh
 CONCURRENT: dict[str, str | bool] = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 """Kernels that do not wait for each other's results run at the same time."""
 DIGEST = hashlib.sha256().digest_size
+_fetched: dict[Path, Future] = {}
+"""Programs that are being read."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,18 @@ class Programs:
     def __contains__(self, name: str) -> bool:
         return self._path(name).exists()
 
+    def fetch(self, *names: str) -> None:
+        """Begin to read these programs, if they are there; `read` waits for them."""
+        for name in names:
+            if name in self:
+                _fetched[self._path(name)] = in_thread(self._read, name)
+
     def read(self, name: str) -> jax.stages.Compiled | None:
         """A program; None where it is not there, damaged, or cannot be loaded here."""
+        begun = _fetched.pop(self._path(name), None)
+        return self._read(name) if begun is None else begun.result()
+
+    def _read(self, name: str) -> jax.stages.Compiled | None:
         try:
             content = self._path(name).read_bytes()
             if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:
@@ -79,6 +91,23 @@ def compiled(name: str, lower: Callable[[], jax.stages.Lowered], kept: Programs 
         if kept is not None:
             in_thread(kept.write, name, program)
     return program
+
+
+class Kept:
+    """A function that `jax.jit` made and whose arguments always have the same shapes; its program is kept.
+
+    It is read or compiled at the first call. Without `kept` it is the function itself.
+    """
+
+    def __init__(self, name: str, function: Any, kept: Programs | None) -> None:
+        self._name, self._function, self._kept = name, function, kept
+        self._program: Any = None if kept is not None else function
+
+    def __call__(self, *args: Any) -> Any:
+        """What the function returns."""
+        if self._program is None:
+            self._program = compiled(self._name, lambda: self._function.lower(*args), self._kept)
+        return self._program(*args)
 
 
 def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import wraps
-from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 import jax
-
-from whill_mjx.io.compiled import keep_compiled
-from whill_mjx.processor import share_results
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -60,26 +54,6 @@ def join(environment: Mapping[str, str] | None = None) -> int:
         )
     jax.distributed.initialize(address, count, int(index))
     return jax.process_count()
-
-
-def wake_gpu() -> None:
-    """Begin in a thread what a GPU needs before its first program, two seconds in which a command imports its modules.
-
-    For a command's own process, as soon as JAX is imported. Without a GPU, and with several processes, nothing happens.
-    """
-    asked = os.environ.get("JAX_PLATFORMS") or "cuda"
-    if not any(Path("/dev").glob("nvidia[0-9]*")) or not {"cuda", "gpu"} & set(asked.split(",")):
-        return
-    if launched_processes()[0] > 1:
-        return
-    share_results()  # both are read with the first program
-    keep_compiled()
-
-    def wake() -> None:
-        with suppress(Exception):  # it is met again where it matters
-            jax.block_until_ready(jax.numpy.zeros(1))
-
-    threading.Thread(target=wake).start()
 
 
 def choose_devices(count: int | None) -> tuple[jax.Device, ...]:

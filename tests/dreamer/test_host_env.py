@@ -9,11 +9,12 @@ from dreamer_toys import tiny_config
 from gymnasium import spaces as gs
 
 from dreamer import agent, iteration, spaces
+from dreamer.evaluate import Rounds, evaluate
 from dreamer.export import PolicyContract, export_policy
 from dreamer.gym import from_gym, read_actions, read_observations
 from dreamer.policy import Policy, of_agent, save
 from dreamer.spaces import Box, Discrete
-from dreamer.train import TrainingOptions, evaluate, train
+from dreamer.train import TrainingOptions, train
 
 
 class Corridor(gymnasium.Env):
@@ -125,7 +126,7 @@ def learned(tmp_path_factory):
 
 def test_an_environment_of_the_host_is_learned_also_across_a_resume(learned):
     _, run = learned
-    result = evaluate(from_gym(Corridor, 2), CONFIG, run.agent.params, jax.random.PRNGKey(1), 2, max_steps=20)
+    result = evaluate(from_gym(Corridor, 2), CONFIG, run.agent.params, jax.random.PRNGKey(1), 2, Rounds(20))
     np.testing.assert_allclose(result["return"], 1.0 - 0.05 * 2, atol=1e-5)
 
 

@@ -6,27 +6,31 @@ import hashlib
 import json
 import os
 import sys
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import jax
 
-import dreamer
-import whill_mjx
+from dreamer import programs
 from dreamer.programs import Programs
 from whill_mjx.learning.identity import identity_of, vehicle_label
 from whill_mjx.learning.setup import Preset
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 
+PACKAGES = (Path(__file__).parents[1], Path(programs.__file__).parent)
+"""Folders of whill_mjx and dreamer."""
 FOLDER = "programs"
 """Within the folder of JAX's compilation cache."""
+BEGINNING = {"dreamer": ("train_iteration", "init_state"), "ppo": ("ppo_iterate", "ppo_init")}
+"""Programs that each learner begins with."""
 LIBRARIES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 ENVIRONMENT = ("XLA_", "JAX_")
 """Beginnings of the variables that change what is compiled."""
 
 
-def kept_programs(preset: Preset, learner: str, vehicle: Path) -> Programs | None:
+def kept_programs(preset: Preset, learner: str, vehicle: str | Path) -> Programs | None:
     """Where the programs of a training are kept.
 
     None without a compilation cache, on a CPU, with several processes, and for a task or an effect of somebody else's:
@@ -35,7 +39,7 @@ def kept_programs(preset: Preset, learner: str, vehicle: Path) -> Programs | Non
     Args:
         preset: with the options' changes.
         learner: "dreamer" or "ppo".
-        vehicle: vehicle file.
+        vehicle: vehicle file or built-in vehicle.
     """
     folder = jax.config.values["jax_compilation_cache_dir"]
     if not folder or not jax.config.values["jax_enable_compilation_cache"]:
@@ -45,8 +49,16 @@ def kept_programs(preset: Preset, learner: str, vehicle: Path) -> Programs | Non
     if not ours or jax.default_backend() != "gpu" or jax.process_count() > 1:
         return None
     identity = identity_of(preset, learner, 0, vehicle_label(spec, params), None)
-    made_of = [identity, load_intervals(vehicle), learner, surroundings(), code()]
+    intervals = load_intervals(vehicle) if Path(vehicle).is_file() else {}
+    made_of = [identity, intervals, surroundings(), code()]
     return Programs(Path(folder) / FOLDER, _checksum(json.dumps(made_of, sort_keys=True, default=str).encode()))
+
+
+def fetch_programs(preset: Preset, learner: str, vehicle: str | Path) -> None:
+    """Begin to read the programs of a training, where they are kept; a bad vehicle file is somebody else's affair."""
+    with suppress(ValueError, OSError):
+        if (kept := kept_programs(preset, learner, vehicle)) is not None:
+            kept.fetch(*BEGINNING[learner])
 
 
 def surroundings() -> list[str]:
@@ -70,8 +82,7 @@ def surroundings() -> list[str]:
 def code() -> str:
     """Checksum of the files of both packages."""
     found = hashlib.sha256()
-    for package in (whill_mjx, dreamer):
-        root = Path(package.__path__[0])
+    for root in PACKAGES:
         for path in sorted(root.rglob("*")):
             if path.is_file() and "__pycache__" not in path.parts:
                 found.update(f"{path.relative_to(root)} {_checksum(path.read_bytes())}".encode())

@@ -10,7 +10,9 @@ from typing import Any
 import jax
 
 from dreamer import checkpoint
-from dreamer.train import TrainingOptions, evaluate, train
+from dreamer.evaluate import Rounds, evaluate
+from dreamer.programs import Kept, Programs
+from dreamer.train import TrainingOptions, train
 from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices
 from whill_mjx.evaluation.episodes import Course, episode_keys
@@ -51,7 +53,8 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
     devices = choose_devices(options.devices)
     batch = make_training_env(preset, vehicle, devices)
     held_out = make_evaluation_env(preset.task, vehicle, preset.eval_episodes, preset.looks)
-    evaluate = evaluation_of(held_out, preset, options.seed)
+    kept = kept_programs(preset, options.learner, vehicle)
+    evaluate = evaluation_of(held_out, preset, options.seed, kept)
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
         functional_env(batch, preset.safety, targets=TRUTH in preset.learner.decode_only),
@@ -67,7 +70,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
             stop=stopper,
             devices=devices,
             tensorboard=options.tensorboard,
-            kept=kept_programs(preset, options.learner, vehicle),
+            kept=kept,
             announce=stage,
         ),
     )
@@ -82,14 +85,17 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
     vehicles = course.vehicles(keys)
     step, carry = policy_of(options, preset, course)
+    kept = kept_programs(preset, options.learner, vehicle)
 
     @jax.jit
     def ends(params: Any, vehicles: Any, keys: jax.Array) -> dict[str, jax.Array]:
         driver = step_driver(step, params, carry, preset.task.action_repeat)
         return rollout(course.env, vehicles, keys, driver).ends
 
+    ended = Kept("ppo_evaluate", ends, kept)
+
     def evaluate(params: Any, env_steps: int) -> dict[str, float]:
-        episodes = jax.device_get(ends(params, vehicles, keys))
+        episodes = jax.device_get(ended(params, vehicles, keys))
         return mean_figures({**episodes, "return": episodes["episode_return"]})
 
     stopper = Stopper(options.out, preset.stop_success)
@@ -99,7 +105,7 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
         eval_every=preset.eval_every,
         checkpoint_every_s=options.checkpoint_every_s,
         stop=stopper,
-        kept=kept_programs(preset, options.learner, vehicle),
+        kept=kept,
         announce=stage,
     )
     length = Length(preset.total_steps, stopper.total_steps(preset.total_steps))
@@ -107,12 +113,13 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     return Trained(*train_ppo(env, preset.ppo, options.out, length, options.seed, how))
 
 
-def evaluation_of(batch: BatchEnv, preset: Preset, seed: int) -> Evaluate:
+def evaluation_of(batch: BatchEnv, preset: Preset, seed: int, kept: Programs | None = None) -> Evaluate:
     """(params, steps) -> figures of one episode in every instance of `batch`; always the same worlds."""
     env = functional_env(batch, preset.safety, shaped=False)
 
     def run(params: Any, env_steps: int) -> dict[str, float]:
-        return mean_figures(evaluate(env, preset.learner, params, jax.random.key(seed + 77), batch.count))
+        key = jax.random.key(seed + 77)
+        return mean_figures(evaluate(env, preset.learner, params, key, batch.count, Rounds(kept=kept)))
 
     return run
 

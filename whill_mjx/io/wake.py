@@ -1,0 +1,44 @@
+"""What a GPU needs before its first program, begun while a command still imports its modules."""
+
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from whill_mjx.devices import launched_processes
+from whill_mjx.io.compiled import keep_compiled
+from whill_mjx.processor import share_results
+
+DEVICES = Path("/dev")
+
+
+def wake_gpu() -> threading.Thread | None:
+    """Begin it in a thread, which is returned; it takes a second or two.
+
+    For a command's own process, as soon as JAX is imported. Without a GPU, where JAX_PLATFORMS asks for none, and with
+    several processes, nothing happens and None comes back.
+    """
+    asked = os.environ.get("JAX_PLATFORMS") or "cuda"
+    if not any(DEVICES.glob("nvidia[0-9]*")) or not {"cuda", "gpu"} & set(asked.split(",")):
+        return None
+    if launched_processes()[0] > 1:
+        return None  # they have to find each other first
+    share_results()  # both are read with the first program
+    keep_compiled()
+
+    def wake() -> None:
+        import jax
+        import jax.numpy as jnp
+
+        def first(image: jax.Array) -> jax.Array:
+            """A convolution and a product, so that their libraries are loaded too."""
+            return jax.lax.conv(image, image, (1, 1), "SAME")[0, 0] @ image[0, 0]
+
+        with suppress(Exception):  # the command meets it too, and says what it is
+            jax.block_until_ready(jax.jit(first)(jnp.zeros((16, 16, 16, 16), jnp.bfloat16)))
+
+    thread = threading.Thread(target=wake)
+    thread.start()
+    return thread
