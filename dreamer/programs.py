@@ -23,8 +23,6 @@ from jax.sharding import Mesh
 CONCURRENT: dict[str, str | bool] = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 """Kernels that do not wait for each other's results run at the same time."""
 DIGEST = hashlib.sha256().digest_size
-_fetched: dict[Path, Future] = {}
-"""Programs that are being read."""
 
 
 @dataclass(frozen=True)
@@ -38,18 +36,8 @@ class Programs:
     def __contains__(self, name: str) -> bool:
         return self._path(name).exists()
 
-    def fetch(self, *names: str) -> None:
-        """Begin to read these programs, if they are there; `read` waits for them."""
-        for name in names:
-            if name in self:
-                _fetched[self._path(name)] = in_thread(self._read, name)
-
     def read(self, name: str) -> jax.stages.Compiled | None:
         """A program; None where it is not there, damaged, or cannot be loaded here."""
-        begun = _fetched.pop(self._path(name), None)
-        return self._read(name) if begun is None else begun.result()
-
-    def _read(self, name: str) -> jax.stages.Compiled | None:
         try:
             content = self._path(name).read_bytes()
             if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:

@@ -36,7 +36,6 @@ from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import RUN_FILE, Claim, FolderRefused, claim_folder, write_whole
 from whill_mjx.learning.identity import KIND, OUTPUTS, identity_of, vehicle_label
 from whill_mjx.learning.index_page import list_results, write_index
-from whill_mjx.learning.kept import fetch_programs
 from whill_mjx.learning.memory import check_memory
 from whill_mjx.learning.options import TrainOptions, choose_preset, preset_name
 from whill_mjx.learning.outcome import evaluate_policy, export
@@ -62,7 +61,6 @@ def main(options: TrainOptions) -> dict[str, Any]:
     processes = join()
     with refusing():
         preset = choose_preset(options)
-        fetch_programs(preset, options.learner, options.vehicle or options.out / "vehicle.toml")
         check(options, preset, processes)
     with Heartbeat() as heartbeat, begin(options, preset, heartbeat.stage) as vehicle:
         say(f"preset {preset_name(options.preset)}; devices: {', '.join(str(device) for device in jax.devices())}")

@@ -8,7 +8,6 @@ from unittest import mock
 import jax
 import pytest
 
-from dreamer import programs as shared
 from whill_mjx.io import compiled, wake
 from whill_mjx.learning import kept
 from whill_mjx.learning.setup import find_preset
@@ -52,18 +51,6 @@ def test_the_same_training_finds_its_programs_and_another_one_does_not(vehicle, 
     monkeypatch.setattr(kept, "code", lambda: "edited")
     found.append(programs(vehicle))
     assert len({one.made_of for one in found}) == len(found)
-
-
-@pytest.mark.usefixtures("on_gpu")
-def test_programs_are_fetched_by_the_name_of_a_vehicle_as_by_its_file(vehicle):
-    found = programs(vehicle)
-    assert programs("whill_cr_ramp") == found
-    found.write("train_iteration", jax.jit(lambda x: x + 1.0).lower(1.0).compile())
-    kept.fetch_programs(PRESET, "dreamer", "whill_cr_ramp")
-    assert list(shared._fetched) == [found.folder / f"{found.made_of}-train_iteration"]
-    assert found.read("train_iteration")(1.0) == 2.0 and not shared._fetched
-    kept.fetch_programs(PRESET, "dreamer", vehicle.with_name("none.toml"))
-    assert not shared._fetched
 
 
 @pytest.mark.usefixtures("on_gpu")

@@ -30,14 +30,9 @@ def wake_gpu() -> threading.Thread | None:
 
     def wake() -> None:
         import jax
-        import jax.numpy as jnp
-
-        def first(image: jax.Array) -> jax.Array:
-            """A convolution and a product, so that their libraries are loaded too."""
-            return jax.lax.conv(image, image, (1, 1), "SAME")[0, 0] @ image[0, 0]
 
         with suppress(Exception):  # the command meets it too, and says what it is
-            jax.block_until_ready(jax.jit(first)(jnp.zeros((16, 16, 16, 16), jnp.bfloat16)))
+            jax.block_until_ready(jax.numpy.zeros(1))
 
     thread = threading.Thread(target=wake)
     thread.start()

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import sys
-from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,14 +22,12 @@ PACKAGES = (Path(__file__).parents[1], Path(programs.__file__).parent)
 """Folders of whill_mjx and dreamer."""
 FOLDER = "programs"
 """Within the folder of JAX's compilation cache."""
-BEGINNING = {"dreamer": ("train_iteration", "init_state"), "ppo": ("ppo_iterate", "ppo_init")}
-"""Programs that each learner begins with."""
 LIBRARIES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 ENVIRONMENT = ("XLA_", "JAX_")
 """Beginnings of the variables that change what is compiled."""
 
 
-def kept_programs(preset: Preset, learner: str, vehicle: str | Path) -> Programs | None:
+def kept_programs(preset: Preset, learner: str, vehicle: Path) -> Programs | None:
     """Where the programs of a training are kept.
 
     None without a compilation cache, on a CPU, with several processes, and for a task or an effect of somebody else's:
@@ -39,7 +36,7 @@ def kept_programs(preset: Preset, learner: str, vehicle: str | Path) -> Programs
     Args:
         preset: with the options' changes.
         learner: "dreamer" or "ppo".
-        vehicle: vehicle file or built-in vehicle.
+        vehicle: vehicle file.
     """
     folder = jax.config.values["jax_compilation_cache_dir"]
     if not folder or not jax.config.values["jax_enable_compilation_cache"]:
@@ -49,16 +46,8 @@ def kept_programs(preset: Preset, learner: str, vehicle: str | Path) -> Programs
     if not ours or jax.default_backend() != "gpu" or jax.process_count() > 1:
         return None
     identity = identity_of(preset, learner, 0, vehicle_label(spec, params), None)
-    intervals = load_intervals(vehicle) if Path(vehicle).is_file() else {}
-    made_of = [identity, intervals, surroundings(), code()]
+    made_of = [identity, load_intervals(vehicle), surroundings(), code()]
     return Programs(Path(folder) / FOLDER, _checksum(json.dumps(made_of, sort_keys=True, default=str).encode()))
-
-
-def fetch_programs(preset: Preset, learner: str, vehicle: str | Path) -> None:
-    """Begin to read the programs of a training, where they are kept; a bad vehicle file is somebody else's affair."""
-    with suppress(ValueError, OSError):
-        if (kept := kept_programs(preset, learner, vehicle)) is not None:
-            kept.fetch(*BEGINNING[learner])
 
 
 def surroundings() -> list[str]:
