@@ -30,7 +30,8 @@ from whill_mjx.sensors.odometry import Odometry
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.point_goal import PointGoal
 from whill_mjx.tasks.tasks import scale_action
-from whill_mjx.vehicle.specs import VehicleSpec
+from whill_mjx.vehicle.presets import preset_params
+from whill_mjx.vehicle.specs import WHILL_CR, VehicleSpec
 from whill_mjx.world.scene import box, stack_boxes
 
 
@@ -191,10 +192,26 @@ def test_little_noise_flips_no_flag():
 
 @pytest.mark.quick
 def test_a_mount_that_is_none_is_refused():
-    with pytest.raises(ValueError, match="sensor Camera: mount: is {'x': 1}; it must be a CameraMount"):
-        Camera(mount={"x": 1})
+    for kind in (Camera, Depth):
+        with pytest.raises(ValueError, match=f"sensor {kind.__name__}: mount: is .*'x': 1.*; it must be a CameraMount"):
+            kind(mount={"x": 1})
     with pytest.raises(ValueError, match="camera of vehicle 'mine': is .*; it must be a CameraMount"):
         VehicleSpec("mine", 0.1, 0.5, 0.6, 50.0, camera={"x": 1})
+
+
+@pytest.mark.parametrize("kind", [Camera, Depth])
+def test_a_mounted_sensor_sees_what_the_vehicle_s_camera_would_see_there(kind):
+    mount = dataclasses.replace(WHILL_CR.camera, x=-0.2, y=0.1, z=0.9, yaw=2.5)
+    params = preset_params(WHILL_CR)
+    usual, moved = (WHILL_CR, params), (dataclasses.replace(WHILL_CR, camera=mount), params)
+    images = []
+    for vehicle, sensor in ((usual, kind(16, 16, mount=mount)), (moved, kind(16, 16)), (usual, kind(16, 16))):
+        env, _ = make_env("obstacle_course", vehicle=vehicle, observations={"image": sensor})
+        _, first = jax.jit(lambda key, env=env: reset(env, params, key))(jax.random.key(3))
+        images.append(first.obs["image"].astype(float))
+    np.testing.assert_allclose(images[0], images[1], atol=1e-3)
+    assert not np.allclose(images[0], images[2], atol=0.1)
+    assert kind(mount=mount).mirrored is None and kind().mirrored is not None
 
 
 @pytest.mark.quick

@@ -27,7 +27,7 @@ from whill_mjx.learning import ppo
 from whill_mjx.learning.ppo import PpoConfig
 from whill_mjx.learning.shaping import Safety, Step, limited_policy, limiter_of, penalty
 from whill_mjx.sensors import privileged
-from whill_mjx.sensors.camera import is_aside
+from whill_mjx.sensors.image import is_aside
 from whill_mjx.tasks.tasks import Budget, Task, make_task
 from whill_mjx.vehicle.types import TimeStep
 from whill_mjx.vehicle.vehicle_file import load_intervals
