@@ -211,5 +211,13 @@ def make_batch(
     env: Env, params: VehicleParams, count: int, spread: float = 0.0, devices: tuple = (), second_tries: float = 0.0,
     variations: tuple[Variation, ...] = (),
 ) -> BatchEnv:  # fmt: skip
-    """`count` instances of `env`; see `BatchEnv` for the rest."""
+    """`count` instances of `env`; see `BatchEnv` for the rest.
+
+    Raises:
+        ValueError: `env` and `params` are exchanged, or a number is out of its range.
+    """
+    for name, given, kind in (("env", env, Env), ("params", params, VehicleParams)):
+        if not isinstance(given, kind):
+            raise ValueError(f"make_batch: {name} is a {type(given).__name__}, not {kind.__name__}. Give what make_env "
+                             "returns, in its order: make_batch(env, params, count).")
     return BatchEnv(env, params, count, spread, tuple(devices), second_tries, tuple(variations))

@@ -56,6 +56,13 @@ def test_a_batch_refuses_arguments_that_are_no_number_of_instances_or_spread(cha
         make_batch(*make_env("obstacle_course", height=16, width=16), **{"count": 2, **changes})
 
 
+@pytest.mark.quick
+def test_an_environment_and_its_parameters_in_the_wrong_order_are_refused():
+    env, params = make_env("obstacle_course", height=16, width=16)
+    with pytest.raises(ValueError, match="env is a VehicleParams, not Env.*make_batch\\(env, params, count\\)"):
+        make_batch(params, env, 2)
+
+
 @pytest.fixture(scope="module")
 def batch():
     """Episodes of three steps, vehicles that differ, and compiled reset and step."""
