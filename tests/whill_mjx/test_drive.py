@@ -8,7 +8,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from whill_mjx.drive import DriveOptions, main, parse_effect, with_effects
+from whill_mjx.drive import DriveOptions, main
+from whill_mjx.effects.texts import parse_effect, with_effects
 from whill_mjx.io import command_line
 from whill_mjx.logs.manoeuvres import MANOEUVRES, Scenario, command_table
 from whill_mjx.logs.simulated_sensors import Sensors
