@@ -23,12 +23,10 @@ if starts(__name__):
 import numpy as np
 
 from sysid import command_line
-from sysid.errors.pose_objective import Noise
 from sysid.intervals.design import Criterion, Subject, propose
 from sysid.logs.manoeuvre_library import Limits
 from sysid.logs.sources import refuse_recording
 from sysid.search.thin import drives_from
-from whill_mjx.io.fields import Field, check_table
 from whill_mjx.io.folders import check_file, note_written
 from whill_mjx.vehicle.parameters import describe
 from whill_mjx.vehicle.specs import VehicleSpec
@@ -128,21 +126,15 @@ def load_subject(name: str) -> Subject:
     if not Path(name).is_dir():
         spec, params, _ = load_vehicle(name)
         return Subject(spec, params, load_intervals(name) if name.endswith(".toml") else {})
-    from sysid.pages.report import read_report
+    from sysid.pages.report import noise_of
 
     file = str(Path(name) / "vehicle.toml")
     if not Path(file).exists() and (Path(name) / "model.toml").exists():
         raise ValueError(f"{name}: the fit of a model of your own, as which no vehicle of the simulator drives "
                          "(dataset.notes in its report.json say why). Drives are designed for vehicles only; take one "
                          "of similar size, or those that python -m sysid.inspect DATASET proposes.")
-    report = read_report(Path(name))
+    noise = noise_of(Path(name))
     spec, params, _ = load_vehicle(file)
-    outside, own = (tuple(f"{channel}.{key}" for key in keys) for channel, keys in (
-        ("ground_truth", ("x", "y", "yaw")), ("odometry", ("x", "y", "yaw", "v", "omega"))))
-    fields = [Field(key, "SI", 1e-12, 1e6, remedy="Fit the log again.") for key in (*outside, *own)]
-    found = report["noise"].get("scale")
-    scale = check_table(str(Path(name) / "report.json"), fields, found, "noise.scale", others=True)
-    noise = Noise(np.array([scale[key] for key in outside]), np.array([scale[key] for key in own]), "fit")
     return Subject(spec, params, load_intervals(file), noise)
 
 

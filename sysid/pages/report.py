@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sysid.errors.pose_objective import Noise
 from sysid.logs.measured import load_any
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.logs.records import Prediction, Trial
@@ -97,6 +98,16 @@ def read_report(run: Path) -> dict[str, Any]:
                          f"program reads {KIND!r}, schema {SCHEMA}. {AGAIN}")
     check_table(str(path), REPORT, report, others=True)
     return report
+
+
+def noise_of(run: Path) -> Noise:
+    """The noise of a log as the report of its fit has it; ValueError for a report without it."""
+    outside, own = (tuple(f"{channel}.{key}" for key in keys) for channel, keys in (
+        ("ground_truth", ("x", "y", "yaw")), ("odometry", ("x", "y", "yaw", "v", "omega"))))
+    fields = [Field(key, "SI", 1e-12, 1e6, remedy="Fit the log again.") for key in (*outside, *own)]
+    found = read_report(run)["noise"].get("scale")
+    scale = check_table(str(run / "report.json"), fields, found, "noise.scale", others=True)
+    return Noise(np.array([scale[key] for key in outside]), np.array([scale[key] for key in own]), "fit")
 
 
 def write_html(run: Path, series: Sequence[TrialSeries] | None = None, sections: Sequence[Section] = ()) -> Path:
