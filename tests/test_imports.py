@@ -19,10 +19,15 @@ PACKAGES = ("whill_mjx", "sysid", "dreamer", "bridge")
 ALLOWED = {"whill_mjx": set(), "sysid": {"whill_mjx"}, "dreamer": set(), "bridge": set()}
 DOORS = {
     "whill_mjx/train.py": {"dreamer"},  # the training command
-    "bridge/simulate.py": {"whill_mjx", "sysid"},  # the simulator, or a robot file, behind the topics
+    "bridge/simulate.py": {"whill_mjx"},  # the simulator, or a robot file, behind the topics
 }
 ROOMS = {"whill_mjx/learning": {"dreamer"}}  # belongs to the first
-FITTED = {"whill_mjx/learning/vehicle_of_run.py": {"sysid"}}  # so does this file, which has a vehicle fitted
+FILES = {  # belong to the first, and to the second
+    "whill_mjx/learning/vehicle_of_run.py": {"sysid"},
+    "bridge/chair_simulator.py": {"whill_mjx"},
+    "bridge/moved_simulator.py": {"whill_mjx"},
+    "bridge/simulator_choice.py": {"whill_mjx", "sysid"},
+}
 
 READER = "bridge.policy"
 """The one reader of policy files, which all packages may import."""
@@ -53,8 +58,8 @@ def imported(path):
 def test_imports_point_one_way(path):
     relative = path.relative_to(ROOT)
     own = relative.parts[0]
-    looking_up = DOORS.get(relative.as_posix(), set()) | ROOMS.get(relative.parent.as_posix(), set())
-    looking_up |= FITTED.get(relative.as_posix(), set())
+    file = relative.as_posix()
+    looking_up = {**DOORS, **FILES}.get(file, set()) | ROOMS.get(relative.parent.as_posix(), set())
     allowed = {own} | ALLOWED[own] | looking_up
     names = {name for name in imported(path) if name != READER}
     outside = {name.split(".")[0] for name in names} & {*PACKAGES, "benchmarks", "tests"}
@@ -76,6 +81,12 @@ def test_nothing_imports_the_doors():
     doors = {door.removesuffix(".py").replace("/", ".") for door in DOORS}
     importers = {path.name for path in modules() if doors & set(imported(path))}
     assert not importers
+
+
+def test_only_the_command_that_serves_them_imports_the_simulators():
+    own = {name.removesuffix(".py").replace("/", ".") for name in FILES if name.startswith("bridge")}
+    importers = {path.relative_to(ROOT).as_posix() for path in modules() if own & set(modules_used(path))}
+    assert importers - set(FILES) == {"bridge/simulate.py"}
 
 
 def test_no_file_imports_itself_by_way_of_others():

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.plant.first_day import write_urdf
-from bridge.simulate import ChairSimulator, field, make_vehicle, parse_arguments
+from bridge.chair_simulator import ChairSimulator
+from bridge.simulate import field, parse_arguments
 from bridge.simulated import halfway
+from bridge.simulator_choice import make_vehicle
 
 
 @pytest.fixture(scope="module")

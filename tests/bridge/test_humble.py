@@ -48,7 +48,7 @@ import json, sys, time, types
 import humble_stub
 humble_stub.install()
 import numpy as np
-from bridge import commands, drive, guard, vehicle_node
+from bridge import commands, drive, drive_node, guard, vehicle_node
 from bridge.controller import Controller
 from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
@@ -68,7 +68,7 @@ node = humble_stub.Node("bridge_drive")
 kind = "TwistStamped" if "stamped" in options.image_topic else "Twist"
 node.topics["/whill/controller/cmd_vel"] = f"geometry_msgs/msg/{kind}"
 safety = SafetyConfig((-1.0, -1.0), (1.0, 1.0), hold_zeros=False, require_arm=options.require_arm)
-bridge = drive.DriveNode(node, Controller(Policy(), safety), options)
+bridge = drive_node.DriveNode(node, Controller(Policy(), safety), options)
 beat = {"guard": "other", "topic": "/whill/controller/cmd_vel", "type": kind, "ready": True, "stops": 0,
         "hears": [bridge.guard.session]}
 """

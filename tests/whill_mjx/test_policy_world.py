@@ -8,7 +8,8 @@ import marker_seeker
 import pytest
 
 from bridge.policy import PolicyFileError
-from bridge.simulate import make_vehicle, parse_arguments
+from bridge.simulate import parse_arguments
+from bridge.simulator_choice import make_vehicle
 from whill_mjx.evaluate import EvaluateOptions, choose_task
 from whill_mjx.evaluation.policy_file import load_policy
 from whill_mjx.evaluation.policy_world import find_policy, read_world
@@ -33,7 +34,7 @@ class Simulator:
 
 @pytest.fixture
 def simulate(monkeypatch):
-    monkeypatch.setattr("bridge.simulate.ChairSimulator", Simulator)
+    monkeypatch.setattr("bridge.chair_simulator.ChairSimulator", Simulator)
     return lambda *words: make_vehicle(parse_arguments([str(word) for word in words])).given
 
 
