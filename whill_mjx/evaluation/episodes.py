@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.env import Env, reset_state
+from whill_mjx.env.view_from_above import top_view
 from whill_mjx.evaluation.conditions import Condition
 from whill_mjx.evaluation.drivers import Driver, replay_driver
 from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
 from whill_mjx.evaluation.rollouts import CHANNELS, Rollout, View, rollout
-from whill_mjx.look import top_view
 from whill_mjx.vehicle.dynamics import place
 from whill_mjx.vehicle.ground import on_ground
 from whill_mjx.vehicle.types import VehicleParams
