@@ -247,6 +247,18 @@ def summarise(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, Any]:
     return summary
 
 
+def headline(name: str, summary: dict[str, Any]) -> str:
+    """One line of the figures that matter most."""
+    low, high = summary["success_interval_95"]
+    seconds = summary["time_to_goal_s"]
+    others = "".join(f"{ending} {share:.1%}  " for ending, share in other_endings(summary).items())
+    return (
+        f"{name:18s} success {summary['success']:6.1%} [{low:.1%}, {high:.1%}]  collision {summary['collision']:5.1%}  "
+        f"time-out {summary['timeout']:5.1%}  {others}return {summary['return']:.1f}  "
+        f"to the goal {'-' if seconds is None else f'{seconds:.2f} s'}  near misses {summary['near_misses']:.2f}"
+    )
+
+
 def _quantile(ordered: np.ndarray, share: float) -> float | None:
     """Quantile of values (N,) in rising order, between two of them; None where one is infinite, as far from all."""
     place = share * (len(ordered) - 1)
