@@ -157,7 +157,7 @@ def fleet(out: Path, count: int = 12, steps: int = 150) -> None:
     import jax.numpy as jnp
 
     from whill_mjx import make_batch, make_env
-    from whill_mjx.look import top_view
+    from whill_mjx.env.view_from_above import top_view
     from whill_mjx.tasks.doorway import Doorway
     from whill_mjx.vehicle.kinematics import reference_pose
 

@@ -49,8 +49,8 @@ def _drive(seed: int) -> list[np.ndarray]:
     import jax.numpy as jnp
 
     from whill_mjx.env import make_env, observe, reset_state, step_state
+    from whill_mjx.env.view_from_above import top_view
     from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
-    from whill_mjx.look import top_view
     from whill_mjx.vehicle.kinematics import camera_pose, reference_pose
     from whill_mjx.world.render import Quality, pinhole, render
 

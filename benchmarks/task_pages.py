@@ -183,7 +183,7 @@ def worlds(task: Task, out: Path) -> None:
     import numpy as np
 
     from whill_mjx.env import make_env, reset_state
-    from whill_mjx.look import top_view
+    from whill_mjx.env.view_from_above import top_view
     from whill_mjx.vehicle.kinematics import camera_pose
     from whill_mjx.world.maps.walls import shown
     from whill_mjx.world.render import Quality, pinhole, render

@@ -16,15 +16,18 @@ import pytest
 
 from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
-from whill_mjx.evaluate import EvaluateOptions, choose_task, draw, headline, main
+from whill_mjx.evaluate import main
 from whill_mjx.evaluation import pages
 from whill_mjx.evaluation.conditions import nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
-from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures, summarise
+from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures, headline, summarise
 from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
 from whill_mjx.evaluation.onnx_network import Network
+from whill_mjx.evaluation.options import EvaluateOptions
+from whill_mjx.evaluation.output_files import write_pictures
 from whill_mjx.evaluation.pages import episode_video
 from whill_mjx.evaluation.policy_file import load_policy
+from whill_mjx.evaluation.preparation import choose_task
 from whill_mjx.evaluation.rollouts import CHANNELS, View, rollout
 from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, with_parameter
 from whill_mjx.io.html import STYLE
@@ -310,7 +313,7 @@ def test_two_grids_over_the_same_thing_have_a_picture_each(tmp_path, monkeypatch
     monkeypatch.setattr(pages, "sweep_picture", lambda sweep, path, name: path.write_text(str(sweep.axes[0].values)))
     sweeps = [Sweep((Axis("light", values),), 1, {}, {}, []) for values in ((0.5, 1.0), (1.0, 1.5), (1.5, 2.0))]
     options, driven = EvaluateOptions("planner", out=tmp_path), {"planner": made_up([[1.0] * 3], [("success", 0.1)])}
-    pictures, _ = draw(options, make_task("point_goal"), None, driven, "planner", sweeps)
+    pictures, _ = write_pictures(options, make_task("point_goal"), None, driven, "planner", sweeps)
     assert [path.read_text() for path in pictures[1:]] == [str(sweep.axes[0].values) for sweep in sweeps]
 
 

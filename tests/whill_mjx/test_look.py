@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from whill_mjx import look
 from whill_mjx.env import make_env, reset_state
-from whill_mjx.look import Look, _missing, depth_picture, main, top_view, write_png
+from whill_mjx.env.view_from_above import top_view
+from whill_mjx.evaluation import planner_pictures
+from whill_mjx.io.png import write_png
+from whill_mjx.look import Look, main
+from whill_mjx.tasks.check import why_no_world
 from whill_mjx.tasks.tasks import TASKS
+from whill_mjx.world.gallery_pictures import depth_picture
 
 
 @pytest.mark.quick
@@ -45,7 +49,7 @@ def test_unknown_scenes_and_endings_are_refused(tmp_path, options, words):
 
 @pytest.mark.quick
 def test_a_task_that_needs_a_map_is_left_out_of_all():
-    assert "a name is missing" in _missing(TASKS["map_goal"]) and not _missing(TASKS["corridor"])
+    assert "a name is missing" in why_no_world(TASKS["map_goal"]) and not why_no_world(TASKS["corridor"])
 
 
 def test_a_furnished_room_is_seen_from_above_without_its_ceiling():
@@ -69,9 +73,10 @@ def test_the_view_from_above_follows_a_vehicle_that_would_leave_it():
 
 
 def test_a_video_lasts_as_long_as_the_drive_whatever_a_step_holds(tmp_path, monkeypatch):
-    monkeypatch.setattr(look, "first_plan", lambda *_: jnp.zeros(1))
-    monkeypatch.setattr(look, "plan_action", lambda config, env, state, plan, key: (jnp.zeros(2), plan))
-    monkeypatch.setattr(look, "observe", lambda env, state: jnp.full((8, 8, 3), state.step_count).astype(jnp.uint8))
+    monkeypatch.setattr(planner_pictures, "first_plan", lambda *_: jnp.zeros(1))
+    monkeypatch.setattr(planner_pictures, "plan_action", lambda config, env, state, plan, key: (jnp.zeros(2), plan))
+    grey = jnp.ones((8, 8, 3), jnp.uint8)
+    monkeypatch.setattr(planner_pictures, "observe", lambda env, state: grey * state.step_count.astype(jnp.uint8))
     main(Look(scene="point_goal", out=tmp_path / "a.gif", set=("action_repeat=4", "max_steps=12")))
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 3 and film.info["duration"] == 400  # 12 control periods of 0.1 s [ms]

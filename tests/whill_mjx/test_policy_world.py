@@ -10,9 +10,10 @@ import pytest
 from bridge.policy import PolicyFileError
 from bridge.simulate import parse_arguments
 from bridge.simulator_choice import make_vehicle
-from whill_mjx.evaluate import EvaluateOptions, choose_task
+from whill_mjx.evaluation.options import EvaluateOptions
 from whill_mjx.evaluation.policy_file import load_policy
 from whill_mjx.evaluation.policy_world import find_policy, read_world
+from whill_mjx.evaluation.preparation import choose_task
 
 
 @pytest.fixture(scope="module")

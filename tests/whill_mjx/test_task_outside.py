@@ -68,7 +68,8 @@ def test_its_rewards_endings_and_observations_are_those_of_the_step(file):
 
 @pytest.mark.quick
 def test_the_commands_take_its_file_and_its_fields(file):
-    from whill_mjx.evaluate import EvaluateOptions, choose_task
+    from whill_mjx.evaluation.options import EvaluateOptions
+    from whill_mjx.evaluation.preparation import choose_task
     from whill_mjx.learning.options import TrainOptions, choose_preset
 
     options = TrainOptions(task=f"{file}:Parking", preset="cpu", layout="fixed", set=("bay_x=2.8", "action_repeat=3"))

@@ -18,9 +18,10 @@ from dreamer.iteration import credit_rates
 from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
-from whill_mjx.evaluate import EvaluateOptions, choose_task
 from whill_mjx.evaluation.intervals import wilson_interval
+from whill_mjx.evaluation.options import EvaluateOptions
 from whill_mjx.evaluation.policy_file import load_policy
+from whill_mjx.evaluation.preparation import choose_task
 from whill_mjx.io import command_line
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.folders import FolderRefused

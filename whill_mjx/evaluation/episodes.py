@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.env import Env, reset_state
+from whill_mjx.env.view_from_above import top_view
 from whill_mjx.evaluation.conditions import Condition
 from whill_mjx.evaluation.drivers import Driver, replay_driver
 from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
 from whill_mjx.evaluation.rollouts import CHANNELS, Rollout, View, rollout
-from whill_mjx.look import top_view
 from whill_mjx.vehicle.dynamics import place
 from whill_mjx.vehicle.ground import on_ground
 from whill_mjx.vehicle.types import VehicleParams
@@ -245,6 +245,18 @@ def summarise(episodes: Episodes, near_m: float = NEAR_M) -> dict[str, Any]:
     nearest = np.sort(figures["min_clearance_m"])
     summary["min_clearance_m_quantiles"] = {name: _quantile(nearest, float(name)) for name in ("0.01", "0.05", "0.5")}
     return summary
+
+
+def headline(name: str, summary: dict[str, Any]) -> str:
+    """One line of the figures that matter most."""
+    low, high = summary["success_interval_95"]
+    seconds = summary["time_to_goal_s"]
+    others = "".join(f"{ending} {share:.1%}  " for ending, share in other_endings(summary).items())
+    return (
+        f"{name:18s} success {summary['success']:6.1%} [{low:.1%}, {high:.1%}]  collision {summary['collision']:5.1%}  "
+        f"time-out {summary['timeout']:5.1%}  {others}return {summary['return']:.1f}  "
+        f"to the goal {'-' if seconds is None else f'{seconds:.2f} s'}  near misses {summary['near_misses']:.2f}"
+    )
 
 
 def _quantile(ordered: np.ndarray, share: float) -> float | None:

@@ -1,4 +1,4 @@
-"""Videos: H.264 by ffmpeg, which runs as a process of its own."""
+"""Videos: H.264 by ffmpeg, which runs as a process of its own, and GIF."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from whill_mjx.io.folders import whole_file
 
+VIDEOS = (".mp4", ".gif")
+"""Endings of videos that `write_video` writes."""
 EVEN = 2
 """Width and height of an H.264 video are multiples of it; other frames are cut."""
 
@@ -55,3 +57,15 @@ def write_h264(path: Path, frames: Iterable[np.ndarray], rate_hz: float, quality
             raise OSError(f"{path}: ffmpeg ended with code {process.returncode}: {words or 'no reason given'}. "
                           "Free some space, or leave the videos out (--videos 0).")
     return path
+
+
+def write_video(path: Path, frames: list[np.ndarray], scale: int, rate: float) -> None:
+    """Write frames (H, W, 3) uint8 as a video of `rate` frames per second, whole or not at all."""
+    large = [frame.repeat(scale, 0).repeat(scale, 1) for frame in frames]
+    if path.suffix != ".gif":
+        write_h264(path, large, rate)
+        return
+    import imageio.v2 as imageio
+
+    with whole_file(path) as temporary:
+        imageio.mimwrite(temporary, large, duration=1000 / rate, loop=0)  # type: ignore[arg-type]

@@ -127,6 +127,15 @@ def check_world(task: Task) -> Any:
     return _traced(task, "sample_world", key)
 
 
+def why_no_world(task: Task) -> str:
+    """What a world of a task cannot be drawn without, such as a map; nothing for most tasks."""
+    try:
+        check_world(task)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
 def _check_terms(task: Task, terms: Mapping[str, Any], ends: Mapping[str, Any]) -> None:
     """Refuse names that mean nothing: of terms that the rewards lack, and misspelt ones of endings that are counted."""
     if task.per_period is not Task.per_period:
