@@ -22,7 +22,8 @@ from jax.sharding import Mesh
 
 CONCURRENT: dict[str, str | bool] = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 """Kernels that do not wait for each other's results run at the same time."""
-DIGEST = hashlib.sha256().digest_size
+BEGINNING = b"program\n"
+"""Of a file. JAX's own entries begin otherwise: they are packed, and the cache removes those that do not unpack."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,10 @@ class Programs:
         """A program; None where it is not there, damaged, or cannot be loaded here."""
         try:
             content = self._path(name).read_bytes()
-            if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:
+            begin = len(_head(b""))
+            if content[:begin] != _head(content[begin:]):
                 return None
-            return serialize_executable.deserialize_and_load(*pickle.loads(content[DIGEST:]))
+            return serialize_executable.deserialize_and_load(*pickle.loads(content[begin:]))
         except Exception:  # whatever is wrong with it, it can be compiled
             return None
 
@@ -52,13 +54,17 @@ class Programs:
             content = pickle.dumps(serialize_executable.serialize(program))
             self.folder.mkdir(parents=True, exist_ok=True)
             temporary = self.folder / f".{self.made_of}-{name}.{os.getpid()}"
-            temporary.write_bytes(hashlib.sha256(content).digest() + content)
+            temporary.write_bytes(_head(content) + content)
             os.replace(temporary, self._path(name))
         except (OSError, ValueError, TypeError, pickle.PicklingError, jax.errors.JaxRuntimeError):
             return
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{self.made_of}-{name}"
+
+
+def _head(content: bytes) -> bytes:
+    return BEGINNING + hashlib.sha256(content).digest()
 
 
 @dataclass(frozen=True)

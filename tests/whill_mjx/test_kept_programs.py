@@ -69,6 +69,16 @@ def test_programs_of_a_task_from_outside_are_not_kept(vehicle):
     assert programs(vehicle, dataclasses.replace(PRESET, task=Own())) is None
 
 
+@pytest.mark.usefixtures("on_gpu")
+def test_the_cache_keeps_them_when_it_is_tidied(vehicle, tmp_path):
+    found = programs(vehicle)
+    found.write("one", jax.jit(lambda x: x + 1.0).lower(1.0).compile())
+    compiled.tidy(tmp_path)
+    assert found.read("one")(1.0) == 2.0
+    compiled.tidy(tmp_path, most=0)
+    assert "one" not in found
+
+
 def test_nothing_is_kept_on_a_processor(vehicle):
     assert programs(vehicle) is None
 
