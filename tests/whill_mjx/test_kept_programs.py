@@ -98,23 +98,25 @@ def test_the_code_s_checksum_changes_with_a_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "variables, devices, woken",
+    "variables, devices, words, woken",
     [
-        ({}, ["nvidia0", "nvidiactl"], True),
-        ({"JAX_PLATFORMS": "cuda,cpu"}, ["nvidia0"], True),
-        ({"JAX_PLATFORMS": "cpu"}, ["nvidia0"], False),
-        ({}, ["nvidiactl"], False),
-        ({"SLURM_STEP_NUM_TASKS": "2"}, ["nvidia0"], False),
+        ({}, ["nvidia0", "nvidiactl"], ["--out", "run"], True),
+        ({"JAX_PLATFORMS": "cuda,cpu"}, ["nvidia0"], [], True),
+        ({"JAX_PLATFORMS": "cpu"}, ["nvidia0"], [], False),
+        ({}, ["nvidiactl"], [], False),
+        ({}, ["nvidia0"], ["--help"], False),
+        ({"SLURM_STEP_NUM_TASKS": "2"}, ["nvidia0"], [], False),
     ],
 )
 def test_a_gpu_is_woken_where_there_is_one_and_this_process_alone_uses_it(
-    tmp_path, monkeypatch, variables, devices, woken
+    tmp_path, monkeypatch, variables, devices, words, woken
 ):
     for name in devices:
         (tmp_path / name).touch()
     clean = {name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"}
     monkeypatch.setattr(os, "environ", {**clean, **variables, compiled.FOLDER.upper(): str(tmp_path)})
     monkeypatch.setattr(wake, "DEVICES", Path(tmp_path))
+    monkeypatch.setattr(wake.sys, "argv", ["train", *words])
     thread = wake.wake_gpu()
     assert (thread is not None) is woken
     if thread is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -17,14 +18,14 @@ DEVICES = Path("/dev")
 def wake_gpu() -> threading.Thread | None:
     """Begin it in a thread, which is returned; it takes a second or two.
 
-    For a command's own process, as soon as JAX is imported. Without a GPU, where JAX_PLATFORMS asks for none, and with
-    several processes, nothing happens and None comes back.
+    For a command's own process, as soon as JAX is imported. Without a GPU, where JAX_PLATFORMS asks for none, where only
+    help is asked for, and with several processes, nothing happens and None comes back.
     """
     asked = os.environ.get("JAX_PLATFORMS") or "cuda"
     if not any(DEVICES.glob("nvidia[0-9]*")) or not {"cuda", "gpu"} & set(asked.split(",")):
         return None
-    if launched_processes()[0] > 1:
-        return None  # they have to find each other first
+    if {"-h", "--help"} & set(sys.argv) or launched_processes()[0] > 1:  # these have to find each other first
+        return None
     share_results()  # both are read with the first program
     keep_compiled()
 
