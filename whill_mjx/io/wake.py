@@ -18,8 +18,8 @@ DEVICES = Path("/dev")
 def wake_gpu() -> threading.Thread | None:
     """Begin it in a thread, which is returned; it takes a second or two.
 
-    For a command's own process, as soon as JAX is imported. Without a GPU, where JAX_PLATFORMS asks for none, where only
-    help is asked for, and with several processes, nothing happens and None comes back.
+    For a command's own process, as soon as JAX is imported. Without a GPU, where JAX_PLATFORMS asks for none, for help
+    alone, and with several processes, nothing happens and None comes back.
     """
     asked = os.environ.get("JAX_PLATFORMS") or "cuda"
     if not any(DEVICES.glob("nvidia[0-9]*")) or not {"cuda", "gpu"} & set(asked.split(",")):
