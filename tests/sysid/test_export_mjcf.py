@@ -11,8 +11,12 @@ import pytest
 
 from whill_mjx import export_mjcf
 from whill_mjx.effects import make_effect
-from whill_mjx.export_mjcf import Replay, VehicleForces, export, held, in_proportion, load_forces, replay, vehicle_mjcf
-from whill_mjx.logs.manoeuvres import Scenario, command_table
+from whill_mjx.export.force_callback import VehicleForces
+from whill_mjx.export.mjcf_text import vehicle_mjcf
+from whill_mjx.export.mujoco_check import BothDrives, drive_both, scenario_in_proportion
+from whill_mjx.export.mujoco_folder import export_folder
+from whill_mjx.export_mjcf import load_forces
+from whill_mjx.logs.manoeuvres import Scenario, command_table, held_commands
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.specs import HUSKY, WHILL_CR
 from whill_mjx.vehicle.vehicle_file import load_vehicle, save_vehicle
@@ -32,23 +36,24 @@ def folder(tmp_path_factory):
                make_effect("sensor_delay", delay=0.03))
     save_vehicle(root / "vehicle.toml", spec, dataclasses.replace(params, body=body, effects=effects))
     spec, params, _ = load_vehicle(root / "vehicle.toml")
-    return export(spec, params, root / "mujoco")
+    return export_folder(spec, params, root / "mujoco")
 
 
 def test_c_mujoco_drives_a_figure_eight_as_the_simulator_does(folder):
     """Within 6 mm and 2 mrad over the whole drive; MuJoCo moves with the speed at a step's end, half a step early."""
-    found = replay(folder, held(command_table("figure_eight", Scenario()), 0.005))
+    found = drive_both(folder, held_commands(command_table("figure_eight", Scenario()), 0.005))
     assert np.ptp(found.simulator[:, 0]) > 1.5 and np.ptp(np.unwrap(found.simulator[:, 2])) > 6.0
     assert found.distance < 6e-3 and found.turn < 2e-3
 
 
 def test_a_vehicle_that_tips_over_is_compared_until_then():
     upright, fallen = np.zeros((4, 3)), np.array([[0, 0, 0], [0.001, 0, 0.002], [1, 0, 3], [1, 0, 3]], float)
-    found = Replay(fallen, upright, np.array([0.0, 0.1, 1.2, 1.5]))
+    found = BothDrives(fallen, upright, np.array([0.0, 0.1, 1.2, 1.5]))
     assert (found.upright, found.distance, found.turn) == (2, 0.001, 0.002)
     small = dataclasses.replace(WHILL_CR, track=WHILL_CR.track / 4)
-    assert in_proportion(WHILL_CR) == Scenario()
-    assert (in_proportion(small).v, in_proportion(small).omega) == pytest.approx((0.3, 1.0))  # 1.0: the limit
+    assert scenario_in_proportion(WHILL_CR) == Scenario()
+    slower = scenario_in_proportion(small)
+    assert (slower.v, slower.omega) == pytest.approx((0.3, 1.0))  # 1.0: the limit
 
 
 def test_the_callback_repeats_itself_within_a_step_and_starts_afresh_when_time_goes_back(folder):
@@ -102,7 +107,7 @@ def test_a_scene_that_cannot_be_driven_says_why(folder, tmp_path):
         with pytest.raises(ValueError, match=message):
             VehicleForces(spec, params, mujoco.MjModel.from_xml_string(text.replace(old, new)))
     with pytest.raises(ValueError, match="exists already"):
-        export(spec, params, folder)
+        export_folder(spec, params, folder)
     assert not list(folder.parent.glob(".*partial*"))
 
 

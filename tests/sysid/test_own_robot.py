@@ -18,7 +18,9 @@ from sysid.fit import main as fit_main
 from sysid.logs.log import load_log, of_file
 from sysid.missing.fit_statistics import load_fitted
 from sysid.replay.robot_loading import load_robot
-from whill_mjx.export_mjcf import export, held, replay
+from whill_mjx.export.mujoco_check import drive_both
+from whill_mjx.export.mujoco_folder import export_folder
+from whill_mjx.logs.manoeuvres import held_commands
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle
 
 WRONG = Wrong(x=0.05, y=-0.02)
@@ -88,6 +90,6 @@ def test_a_drive_is_designed_for_the_robot(run, tmp_path):
 @pytest.mark.long
 def test_the_robot_drives_in_c_mujoco_as_in_the_simulator(run, tmp_path):
     spec, params, _ = load_vehicle(run / "vehicle.toml")
-    found = replay(export(spec, params, tmp_path / "mujoco"), held(drives(3)["s_curve"], 0.005))
+    found = drive_both(export_folder(spec, params, tmp_path / "mujoco"), held_commands(drives(3)["s_curve"], 0.005))
     assert np.ptp(found.simulator[:, 0]) > 0.2
     assert found.distance < 0.005 and found.turn < 0.01

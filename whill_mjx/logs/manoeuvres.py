@@ -113,3 +113,9 @@ def command_table(name: str, scenario: Scenario | None = None) -> np.ndarray:
     t = np.arange(round(float(ends[-1]) / scenario.dt)) * scenario.dt
     piece = np.searchsorted(ends, t + 1e-9, side="right")
     return np.column_stack([t, np.array(pieces)[piece, 1:]])
+
+
+def held_commands(table: np.ndarray, dt: float) -> np.ndarray:
+    """Commands (S, 2) in force in the middle of each step, of a table (T, 3) of t, v, omega."""
+    t = (np.arange(math.ceil(table[-1, 0] / dt)) + 0.5) * dt
+    return np.asarray(table[np.searchsorted(table[:, 0], t, side="right") - 1, 1:], float)
