@@ -23,10 +23,11 @@ import numpy as np
 from bridge import parameters, ros
 from bridge.bases import BASES
 from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
+from bridge.dataset_file import add_dataset_options, check_dataset, write_dataset_file
 from bridge.exits import Exit, OptionError, refusal
 from bridge.fitted_reach import simulate_reach
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
-from bridge.record import RecordNode, add_dataset_options, check_dataset, write_dataset_file
+from bridge.record_node import RecordNode
 from bridge.safety import Command, SafetyConfig, State, Supervisor
 from bridge.trial_writer import TrialWriter
 from bridge.vehicle_node import VehicleNode, add_options, limits
