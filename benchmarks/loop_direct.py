@@ -18,7 +18,7 @@ from benchmarks.plant.make import Experiment
 from benchmarks.plant.make import plan as plan_day
 from benchmarks.plant.online import OnlinePlant
 from bridge.command_table import PERIOD, CommandTable, make_table, read_commands
-from bridge.record import write_dataset_file
+from bridge.dataset_file import write_dataset_file
 from bridge.trial_writer import TrialWriter
 
 LIMITS = (2.0, 4.0)

@@ -10,205 +10,25 @@ Whatever stops `bridge.drive` stops a manoeuvre too. A stopped replicate is put 
 
 import argparse
 import math
-import os
-import select
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from bridge import parameters, ros
 from bridge.bases import BASES
-from bridge.command_table import PERIOD, CommandTable, check_space, make_table, reach_of, read_commands
+from bridge.command_table import CommandTable, check_space, make_table, reach_of, read_commands
+from bridge.dataset_file import add_dataset_options, check_dataset, write_dataset_file
 from bridge.exits import Exit, OptionError, refusal
 from bridge.fitted_reach import simulate_reach
+from bridge.manoeuvre_node import ManoeuvreNode
 from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
-from bridge.record import RecordNode, add_dataset_options, check_dataset, write_dataset_file
-from bridge.safety import Command, SafetyConfig, State, Supervisor
+from bridge.player import Player
+from bridge.safety import SafetyConfig
 from bridge.trial_writer import TrialWriter
-from bridge.vehicle_node import VehicleNode, add_options, limits
-from bridge.vehicle_time import VehicleTime
+from bridge.vehicle_node import add_options, limits
 
 NAME = "bridge.manoeuvre"
-BACK = "bring the vehicle back to its start, then arm"
-FINISHED = "all replicates are driven"
 WIDEST = (2.0, 4.0)
 """Commands that no manoeuvre exceeds: v [m/s], omega [rad/s]."""
-
-
-class Player:
-    """Plays a command table through the safety state machine; pure, with injected time.
-
-    A `frame` of the supervisor is a row of the table, so a player that is not called for a while stops the vehicle, as
-    a silent camera would.
-    """
-
-    def __init__(self, table: CommandTable, safety: SafetyConfig, repeat: int = 1) -> None:
-        self.table, self.repeat = table, repeat
-        self.clock: Callable[[float], float] = lambda now: now
-        """Seconds of the clock that the table counts in, from the steady time; simulated time may be another one. What
-        stops the vehicle is timed by the clock of `now`."""
-        self.supervisor = Supervisor(safety)
-        self.driven = 0
-        """Replicates driven to their end."""
-        self.aborted = 0
-        """Replicates that were stopped on the way."""
-        self.elapsed: float | None = None
-        """Seconds since the start of the replicate; None while none is driven."""
-        self._due = -math.inf
-        self._rows = 0
-        self._began = 0.0
-
-    @property
-    def finished(self) -> bool:
-        """True when all replicates are driven."""
-        return self.driven >= self.repeat
-
-    def on_tick(self, now: float) -> Command | None:
-        """Return the next row of the table where it is due, zero where the vehicle must stand."""
-        supervisor = self.supervisor
-        if self.elapsed is not None:
-            command = supervisor.tick(now)  # sees that the rows have stopped, too
-            if not supervisor.may_drive:
-                self.elapsed, self.aborted = None, self.aborted + 1
-                return self._send(command)
-        if self.finished:
-            return self._send(supervisor.tick(now))
-        at = self.clock(now)
-        if 1e-6 < self._due - at < 2 * PERIOD:  # stamps of simulated time are not exact sums of the period
-            return None
-        self._due = at + PERIOD if abs(at - self._due) > PERIOD else self._due + PERIOD  # also where time began again
-        self._rows += 1
-        supervisor.frame(now, now, self._rows)
-        if not supervisor.may_drive:
-            return self._send(supervisor.tick(now))
-        if self.elapsed is None:
-            self._began = at
-        self.elapsed = at - self._began
-        if self.elapsed >= self.table.seconds:
-            self.elapsed, self.driven = None, self.driven + 1
-            supervisor.latch(FINISHED if self.finished else BACK)
-            return self._send(supervisor.tick(now))
-        return self._send(supervisor.action(now, np.array(self.table.at(self.elapsed))))
-
-    def since_start(self, now: float) -> float:
-        """Return the seconds from the start of the replicate to the steady time `now`, by the table's clock."""
-        return self.clock(now) - self._began
-
-    def farewell(self) -> bool:
-        """Return whether the vehicle needs zeros before the node ends."""
-        return self.supervisor.state is not State.YIELDED and self.supervisor.take_turn()
-
-    def _send(self, command: Command) -> Command | None:
-        return command if self.supervisor.take_turn() else None
-
-
-class ManoeuvreNode(VehicleNode):
-    """Connects a player to the ROS graph, and records each replicate."""
-
-    def __init__(self, node: Any, player: Player, options: argparse.Namespace) -> None:
-        simulated = VehicleTime() if ros.uses_simulated_time(node) else None
-        super().__init__(node, player, options, simulated or time.monotonic)
-        self.player = player
-        self._recorder = RecordNode(node, None, options) if options.dataset else None
-        self.trials: list[Path] = []
-        """Folders of the replicates that were driven to their end."""
-        self._over_since = time.monotonic()
-        self._driven_before = 0
-        self.failure = ""
-        """Why the drive ended early, such as a full disk."""
-        self._simulated = 0.0
-        if simulated is not None:
-            player.clock = lambda _: self._simulated
-            ros.subscribe_clock(node, lambda seconds: self._on_clock(simulated, seconds))
-        ros.steady_timer(node, PERIOD / 2, self._on_progress)
-        self.start()
-
-    def finished(self) -> bool:
-        """Return whether all is driven and the vehicle has stood for a moment."""
-        over = self.player.finished and self._recording is None
-        if not over:
-            self._over_since = time.monotonic()
-        return bool(self.failure) or time.monotonic() - self._over_since > 1.0
-
-    def _on_clock(self, vehicle_time: VehicleTime, seconds: float) -> None:
-        """Take the simulated time, and send the row that is due."""
-        vehicle_time.on_clock()
-        self._simulated = seconds
-        self._on_input(self.now())
-        self._on_progress()
-
-    def details(self) -> dict[str, Any]:
-        """Return the progress of the manoeuvre."""
-        player = self.player
-        return {"manoeuvre": {"replicate": min(player.driven + 1, player.repeat), "of": player.repeat,
-                              "elapsed": player.elapsed, "seconds": player.table.seconds,
-                              "driven": player.driven, "aborted": player.aborted}}
-
-    @property
-    def _recording(self) -> TrialWriter | None:
-        return self._recorder.writer if self._recorder else None
-
-    def _on_progress(self) -> None:
-        """Open a recording when a replicate begins, close it when it ends; heed Enter in the terminal."""
-        player, recorder = self.player, self._recorder
-        if _enter_was_pressed():
-            self._on_rearm(None)
-        if recorder is None:
-            return
-        if recorder.failure:
-            self.supervisor.latch("the recording failed")
-            self.failure = str(recorder.failure)
-        elif player.elapsed is not None and recorder.writer is None:
-            self._driven_before = player.driven
-            try:
-                recorder.writer = TrialWriter(self.options.dataset, self._trial_name())
-                recorder.writer.begin(recorder.now() - player.since_start(self.now()))
-            except (OSError, ValueError) as error:
-                self.supervisor.latch("the recording failed")
-                self.failure = str(error)
-        elif recorder.writer is not None and player.elapsed is None:
-            self._end_recording(recorder)
-
-    def _end_recording(self, recorder: RecordNode) -> None:
-        """Make a trial of a replicate that was driven to its end, and put any other one aside."""
-        writer, recorder.writer = recorder.writer, None
-        try:
-            if self.player.driven > self._driven_before:
-                self.trials.append(writer.close())
-                self.node.get_logger().info(f"{self.trials[-1]}: rows {writer.rows}")
-            else:
-                aside = writer.put_aside()
-                self.node.get_logger().warning(f"stopped on the way; what was recorded is in {aside}")
-        except OSError as error:
-            self.supervisor.latch("the recording failed")
-            self.failure = self.failure or str(error)
-
-    def close(self) -> None:
-        """End the node, and the recording of a replicate that is on its way."""
-        with ros.undisturbed():
-            super().close()
-            if self._recorder is not None and self._recorder.writer is not None:
-                self._end_recording(self._recorder)
-
-    def _trial_name(self) -> str:
-        return f"{self.options.trial}_{self.options.first + self.player.driven}"
-
-
-def _enter_was_pressed() -> bool:
-    """Return whether the operator pressed Enter in the terminal; False where there is no terminal."""
-    if not sys.stdin or not sys.stdin.isatty():
-        return False
-    try:
-        in_front = os.getpgrp() == os.tcgetpgrp(sys.stdin.fileno())
-    except OSError:  # not the terminal of this session, as after setsid
-        return False
-    ready, _, _ = select.select([sys.stdin], [], [], 0) if in_front else ([], [], [])
-    line = sys.stdin.readline() if ready else ""
-    return line.endswith("\n") and not line.strip()  # the end of the input, Ctrl-D, is no Enter
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:

@@ -20,7 +20,8 @@ from bridge.bases import BASES
 from bridge.commands import Commanders, CommandListener, CommandTopic, Ear, Endpoint, endpoints
 from bridge.diagnosis import fitting, mixed
 from bridge.exits import OptionError
-from bridge.guard import BEAT_PERIOD, GuardLink
+from bridge.guard_link import GuardLink
+from bridge.heartbeat import BEAT_PERIOD
 from bridge.joystick_lock import JoystickLock
 from bridge.options import in_range, topic_name, whole
 from bridge.safety import Command, State, Supervisor

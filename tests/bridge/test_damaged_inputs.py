@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from bridge.command_table import make_table, read_commands
 from bridge.episodes import LENGTH, EpisodeServer, ProtocolError, encode, number, receive
-from bridge.guard import read_beat
+from bridge.heartbeat import read_beat
 from bridge.image import ImageError, compressed_to_rgb8
 from bridge.mcap_file import HEAD, MAGIC, _end, mend
 from bridge.parameters import as_options
-from bridge.record import recover
+from bridge.recovery import recover
 from bridge.view import read_calibration
 
 pytestmark = pytest.mark.quick

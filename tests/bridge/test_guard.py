@@ -10,8 +10,11 @@ import pytest
 
 from bridge import ros
 from bridge.commands import CommandTopic, Endpoint
-from bridge.guard import GuardLink, GuardNode, Watchdog, read_beat
+from bridge.guard_link import GuardLink
+from bridge.guard_node import GuardNode
+from bridge.heartbeat import read_beat
 from bridge.vehicle_node import VehicleNode
+from bridge.watchdog import Watchdog
 
 pytestmark = pytest.mark.quick
 

@@ -48,7 +48,7 @@ import json, sys, time, types
 import humble_stub
 humble_stub.install()
 import numpy as np
-from bridge import commands, drive, drive_node, guard, vehicle_node
+from bridge import commands, drive, drive_node, guard, guard_node, vehicle_node
 from bridge.controller import Controller
 from bridge.policy import SensorInput
 from bridge.safety import SafetyConfig
@@ -85,7 +85,7 @@ for i in range(6):
     assert begun[-1] == len(node.publishers["/whill/controller/cmd_vel"].sent)  # the next step begins after the command
     time.sleep(0.012)  # housekeeping waits until the frame is done
     node.fire()
-watch = guard.GuardNode(humble_stub.Node("bridge_guard"), guard.parse_arguments([]))
+watch = guard_node.GuardNode(humble_stub.Node("bridge_guard"), guard.parse_arguments([]))
 watch.node.fire()
 bridge.close()
 assert isinstance(drive.ros.make_executor(), humble_stub.SingleThreadedExecutor)

@@ -4,9 +4,9 @@ import pytest
 
 from bridge.drive import main
 from bridge.exits import Exit
-from bridge.guard import FORGET, Watchdog
 from bridge.joystick_lock import AGAIN, NOT_LOCKED, JoystickLock
 from bridge.safety import SafetyConfig, Supervisor
+from bridge.watchdog import FORGET, Watchdog
 
 pytestmark = pytest.mark.quick
 

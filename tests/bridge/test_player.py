@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from bridge.command_table import make_table
-from bridge.manoeuvre import BACK, FINISHED, Player, _enter_was_pressed
+from bridge.manoeuvre_node import _enter_was_pressed
+from bridge.player import BACK, FINISHED, Player
 from bridge.safety import SafetyConfig
 from bridge.vehicle_time import VehicleTime
 

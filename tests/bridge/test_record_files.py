@@ -9,8 +9,10 @@ import tomllib
 
 import pytest
 
+from bridge.dataset_file import toml_text, write_dataset_file
 from bridge.exits import Exit
-from bridge.record import believed, finish, main, parse_arguments, toml_text, write_dataset_file
+from bridge.record import finish, main, parse_arguments
+from bridge.record_node import believed
 from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
 from bridge.split_writer import SplitWriter
 from bridge.trial_writer import TrialWriter

@@ -80,7 +80,8 @@ def test_whole_recording_gets_what_was_published_before_it_began(raw):
 
 def test_commands_that_the_middleware_lost_are_reported():
     from bridge import ros
-    from bridge.record import RecordNode, parse_arguments
+    from bridge.record import parse_arguments
+    from bridge.record_node import RecordNode
 
     node = Node(ros.reliable())
     recorder = RecordNode(node, None, parse_arguments(["logs", "one"]))
