@@ -89,6 +89,13 @@ def test_only_the_command_that_serves_them_imports_the_simulators():
     assert importers - set(FILES) == {"bridge/simulate.py"}
 
 
+def test_commands_are_thin():
+    written = {path: path.read_text() for package in PACKAGES for path in (ROOT / package).glob("*.py")}
+    written.pop(ROOT / "dreamer/train.py")  # a function; as a command it says so
+    commands = {path.name: text.count("\n") for path, text in written.items() if "if __name__ == " in text}
+    assert len(commands) > 20 and not {name: lines for name, lines in commands.items() if lines >= 150}
+
+
 def test_no_file_imports_itself_by_way_of_others():
     assert circles(import_graph(ROOT, (*PACKAGES, "benchmarks"))) == []
 
