@@ -79,6 +79,12 @@ def test_the_cache_keeps_them_when_it_is_tidied(vehicle, tmp_path):
     assert "one" not in found
 
 
+@pytest.mark.usefixtures("on_gpu")
+def test_programs_of_several_devices_are_not_kept(vehicle):
+    devices = (jax.devices()[0], jax.devices()[0])
+    assert kept.kept_programs(PRESET, "dreamer", vehicle, devices) is None and programs(vehicle) is not None
+
+
 def test_nothing_is_kept_on_a_processor(vehicle):
     assert programs(vehicle) is None
 

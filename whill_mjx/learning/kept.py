@@ -27,19 +27,20 @@ ENVIRONMENT = ("XLA_", "JAX_")
 """Beginnings of the variables that change what is compiled."""
 
 
-def kept_programs(preset: Preset, learner: str, vehicle: Path) -> Programs | None:
+def kept_programs(preset: Preset, learner: str, vehicle: Path, devices: tuple = ()) -> Programs | None:
     """Where the programs of a training are kept.
 
-    None without a compilation cache, on a CPU, with several processes, and for a task or an effect of somebody else's:
-    what else their files depend on is not known.
+    None without a compilation cache, on a CPU, with several devices or processes, and for a task or an effect of
+    somebody else's: what else their files depend on is not known.
 
     Args:
         preset: with the options' changes.
         learner: "dreamer" or "ppo".
         vehicle: vehicle file.
+        devices: over which the training is split.
     """
     folder = jax.config.values["jax_compilation_cache_dir"]
-    if not folder or not jax.config.values["jax_enable_compilation_cache"]:
+    if devices or not folder or not jax.config.values["jax_enable_compilation_cache"]:
         return None
     spec, params, _ = load_vehicle(vehicle)
     ours = all(type(one).__module__.startswith("whill_mjx.") for one in (preset.task, *params.effects))

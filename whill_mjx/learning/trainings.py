@@ -53,7 +53,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
     devices = choose_devices(options.devices)
     batch = make_training_env(preset, vehicle, devices)
     held_out = make_evaluation_env(preset.task, vehicle, preset.eval_episodes, preset.looks)
-    kept = kept_programs(preset, options.learner, vehicle)
+    kept = kept_programs(preset, options.learner, vehicle, devices)
     evaluate = evaluation_of(held_out, preset, options.seed, kept)
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
@@ -85,7 +85,7 @@ def train_baseline(options: TrainOptions, preset: Preset, vehicle: Path, stage: 
     keys = episode_keys(options.seed + 77, preset.eval_episodes)
     vehicles = course.vehicles(keys)
     step, carry = policy_of(options, preset, course)
-    kept = kept_programs(preset, options.learner, vehicle)
+    kept = kept_programs(preset, options.learner, vehicle, devices)
 
     @jax.jit
     def ends(params: Any, vehicles: Any, keys: jax.Array) -> dict[str, jax.Array]:
