@@ -10,18 +10,23 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.monitoring
 from jax.experimental import serialize_executable
 from jax.sharding import Mesh
 
 CONCURRENT: dict[str, str | bool] = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 """Kernels that do not wait for each other's results run at the same time."""
+CACHE_HIT = "/jax/compilation_cache/cache_hits"
+_thread = threading.local()
 BEGINNING = b"program\n"
 """Of a file. JAX's own entries begin otherwise: they are packed, and the cache removes those that do not unpack."""
 
@@ -78,13 +83,34 @@ class Place:
 
 
 def compiled(name: str, lower: Callable[[], jax.stages.Lowered], kept: Programs | None) -> jax.stages.Compiled:
-    """The kept program of this name, or else what `lower` gives, compiled and kept."""
+    """The kept program of this name, or else what `lower` gives, compiled and kept.
+
+    One that JAX read from its own cache is not kept: XLA writes only part of what it has read itself.
+    """
     program = None if kept is None else kept.read(name)
     if program is None:
-        program = compile_lowered(lower())
-        if kept is not None:
+        lowered = lower()
+        _listen()
+        reads = _reads()
+        program = compile_lowered(lowered)
+        if kept is not None and _reads() == reads:
             in_thread(kept.write, name, program)
     return program
+
+
+@lru_cache(maxsize=1)
+def _listen() -> None:
+    """Count in each thread, from now on, what JAX reads from its own cache."""
+
+    def heard(event: str, **about: Any) -> None:
+        if event == CACHE_HIT:
+            _thread.reads = _reads() + 1
+
+    jax.monitoring.register_event_listener(heard)
+
+
+def _reads() -> int:
+    return getattr(_thread, "reads", 0)
 
 
 class Kept:
