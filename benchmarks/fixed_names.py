@@ -28,6 +28,7 @@ SAME: dict[str, dict[str, str]] = {
     "sight": {"foreign_stopped_plain": "foreign_with_stop_plain_stopped",
               "rich_wallclock_ratio": "rich_step_time_ratio"},
     "undeclared": {"class_accuracy_2x_noisy": "class_accuracy_2x_noise_2",
+                   "interval_width_ratio": "interval_width_ratio_fresh",
                    "noise_factor_coverage": "noise_factor_coverage_noise"},
 }  # fmt: skip
 """Of each file, the fixed names of figures that have another name too."""

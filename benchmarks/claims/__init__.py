@@ -49,7 +49,8 @@ HEADLINES = (  # file, what, value
         "undeclared",
         "Logs with one hidden effect that is named right, at two to four times the size that could just be noticed; "
         "with two at once, both",
-        "{class_accuracy_fresh|%} (wrong: {wrong_name_fresh|%}); {pair_both_fresh|%} (wrong: {pair_wrong_fresh|%})",
+        "{class_accuracy_fresh|%} of {class_accuracy_fresh|.n} (wrong: {wrong_name_fresh|%}); "
+        "{pair_both_fresh|%} of {pair_both_fresh|.n} (wrong: {pair_wrong_fresh|%})",
     ),
     (
         "undeclared",
