@@ -1,10 +1,12 @@
 """Digests of lowered programs, or their seconds with those of a fit and a loop, of whichever tree is on the path.
 
-Run by `benchmarks.house` once for each of two trees, as a script: it imports the packages by the places of either.
+Run by `benchmarks.house` once for each of two trees, as a script: it imports the packages by the places of either, and
+nothing before that, since an older tree has other modules.
 """
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import re
@@ -16,9 +18,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-
-from bridge.options import Parser
-from whill_mjx.io.command_line import guarded
 
 COUNT = 64  # instances
 REPEATS = 5
@@ -149,7 +148,7 @@ def loop() -> float:
 
 def main() -> None:
     """Write digests or seconds as JSON."""
-    parser = Parser(prog="python -m benchmarks.house_programs", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.house_programs", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="file to write")
     parser.add_argument("--lowered", action="store_true", help="digests of programs")
     parser.add_argument("--times", nargs="*", default=[], help="programs whose seconds are wanted")
@@ -164,6 +163,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with guarded():
-        found("share_results", "whill_mjx.processor")()
-        main()
+    found("share_results", "whill_mjx.processor")()
+    main()
