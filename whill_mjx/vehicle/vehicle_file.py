@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -150,11 +149,6 @@ def load_statistics(path: str | Path) -> dict[str, Any] | None:
     path = Path(path)
     table = _read(path).get("statistics")
     return None if table is None else fields.check_table(str(path), fields.STATISTICS, table, "statistics", NEWER)
-
-
-def sha256_of(path: str | Path) -> str:
-    """SHA-256 of a file, as policy files record it."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def _parameter_tables(holder: str, value: Any, intervals: dict[str, tuple[float, float]]) -> dict[str, Any]:
