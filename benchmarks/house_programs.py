@@ -148,7 +148,8 @@ def loop() -> float:
 
 def main() -> None:
     """Write digests or seconds as JSON."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.house_programs", description=__doc__)
+    name = "python -m benchmarks.house_programs"
+    parser = argparse.ArgumentParser(prog=name, usage=argparse.SUPPRESS, description=__doc__)  # an error is one line
     parser.add_argument("--out", type=Path, required=True, help="file to write")
     parser.add_argument("--lowered", action="store_true", help="digests of programs")
     parser.add_argument("--times", nargs="*", default=[], help="programs whose seconds are wanted")
