@@ -8,7 +8,12 @@ The option is one of the whole process, and XLA aborts with it on programs of ot
 or two boxes on a plane. So no import asks for it. Our commands do before JAX starts, unless they step a user's robot.
 
 Vectors of 512 bits are asked for too, where the processor has them: LLVM prefers 256, with which the camera takes half
-as long again. This option is known to all versions of JAX that the package allows.
+as long again.
+
+Loops with many results are not made of vectors by default: their results might lie over one another, which takes more
+than 128 comparisons to rule out. LLVM is asked to make them, where no accelerator is there, which would read the option
+too. A replay of drives then takes four fifths of the time. All versions of JAX that the package allows know both
+options; another one ends with an unknown one.
 
 What is left are two hundred loops a step, each a task that a scheduler starts: for a few vehicles that takes longer
 than their arithmetic. `as_one_function` has a part of a program compiled as a single function.
@@ -23,8 +28,10 @@ from pathlib import Path
 from typing import Any
 
 OPTION = "xla_cpu_use_multi_output_fusion"
+VECTORS = "-vectorize-memory-check-threshold=4096"
 FLAG = "--xla_backend_extra_options"
 WIDE = "--xla_cpu_prefer_vector_width"
+DEVICES = Path("/dev")
 
 
 def share_results() -> None:
@@ -34,10 +41,20 @@ def share_results() -> None:
     first program, and afterwards this changes nothing. Results are the same without it, but for the last bits.
     Accelerators ignore it. XLA aborts with it on some programs of plain MJX.
     """
-    wanted = {FLAG: OPTION} | ({WIDE: "512"} if _has_wide_vectors() else {})
-    flags = os.environ.get("XLA_FLAGS", "")
+    own = [f"{FLAG}={OPTION}", f"{FLAG}={OPTION},{VECTORS}"]
+    wanted = {FLAG: own[no_accelerator()].removeprefix(f"{FLAG}=")} | ({WIDE: "512"} if _has_wide_vectors() else {})
+    # What a process that started this one has asked for may be for an accelerator that is not used here.
+    words = os.environ.get("XLA_FLAGS", "").split()
+    flags = " ".join(own[no_accelerator()] if word in own else word for word in words)
     missing = [f"{name}={value}" for name, value in wanted.items() if name not in flags]
     os.environ["XLA_FLAGS"] = " ".join([flags, *missing]).strip()
+
+
+def no_accelerator() -> bool:
+    """Whether JAX will compute on the host: it was asked to, or there is no NVIDIA, AMD or Google device."""
+    if asked := os.environ.get("JAX_PLATFORMS"):
+        return asked == "cpu"
+    return not any(any(DEVICES.glob(device)) for device in ("nvidia[0-9]*", "kfd", "accel*", "vfio/[0-9]*"))
 
 
 def _has_wide_vectors() -> bool:
@@ -68,14 +85,19 @@ def cores() -> int:
 
 def shares_results() -> bool:
     """Whether XLA_FLAGS ask for it."""
-    return f"{FLAG}={OPTION}" in os.environ.get("XLA_FLAGS", "").split()
+    return any(map(_asks, os.environ.get("XLA_FLAGS", "").split()))
 
 
 def keep_results_apart() -> None:
     """Take back `share_results`, which a process that started this one may have called."""
     if shares_results():
         words = os.environ["XLA_FLAGS"].split()
-        os.environ["XLA_FLAGS"] = " ".join(word for word in words if word != f"{FLAG}={OPTION}")
+        os.environ["XLA_FLAGS"] = " ".join(word for word in words if not _asks(word))
+
+
+def _asks(word: str) -> bool:
+    """Whether a word of XLA_FLAGS asks for shared results."""
+    return word.startswith(f"{FLAG}=") and OPTION in word.removeprefix(f"{FLAG}=").split(",")
 
 
 def as_one_function(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -16,7 +16,7 @@ from scipy import special
 from sysid.logs.floor import last_change
 from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
-from sysid.replay.arrays import added, namespace
+from sysid.replay.arrays import added
 
 ORDER = 4  # bins of memory of the filter
 RIDGE = 2e-3  # of the regression, as a share of its data
@@ -39,10 +39,10 @@ class Whitener:
         extra = (1,) * (series.ndim - 3)
         shown = mask.reshape(*mask.shape, *extra)
         scaled = series / self.scale.reshape(-1, *extra) * shown
-        xp, white = namespace(series), scaled.copy()
+        white = scaled.copy()
         for lag, matrix in enumerate(self.coefficients, start=1):
-            white = added(white, np.s_[:, lag:], -xp.einsum("ij,bkj...->bki...", matrix, scaled[:, :-lag]))
-        return xp.einsum("ij,bkj...->bki...", self.inverse, white * (shown > 0))
+            white = added(white, np.s_[:, lag:], -_mixed(matrix, scaled[:, :-lag]))
+        return _mixed(self.inverse, white * (shown > 0))
 
     def flat(self, series: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """The same flat, (B, K C, ...)."""
@@ -51,6 +51,12 @@ class Whitener:
     def scaled(self, factor: float | np.ndarray) -> Whitener:
         """The filter for noise that is larger by a factor, () or (C,)."""
         return Whitener(self.scale * factor, self.coefficients, self.inverse)
+
+
+def _mixed(matrix: np.ndarray, series: np.ndarray) -> np.ndarray:
+    """Series (B, K, C, ...) whose channels are mixed by a matrix (C, C)."""
+    flat = series.reshape(*series.shape[:3], -1)
+    return (matrix @ flat).reshape(series.shape)
 
 
 def fit_whitener(series: np.ndarray, mask: np.ndarray, order: int = ORDER) -> Whitener:

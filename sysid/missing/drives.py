@@ -17,7 +17,7 @@ from sysid.errors.noise import BIN_SHIFT, roughness
 from sysid.logs.records import Trial
 from sysid.logs.replicates import same_course
 from sysid.replay.arrays import Quotients, moved
-from sysid.replay.cores import on_all_cores, on_processor
+from sysid.replay.cores import on_all_cores
 from sysid.replay.records import ODOMETRY, POSE, TURN, Batch, FreeVehicle, Measured, Simulated
 from sysid.replay.rollout import PathReplay, make_batch
 from whill_mjx.effects.supply_sag import ROUND
@@ -26,8 +26,6 @@ from whill_mjx.vehicle.types import parameters_of
 
 SESSION, DRAIN = "supply_sag.session", "supply_sag.drain"  # when a drive begins, and what makes that matter
 RECORD_DT = 0.025  # s between recorded states: bins of motion are ten times as long
-CHUNK = 160  # drives of one replay call: one compilation; fewer cost nearly as much, more outgrow a processor's cache
-ACCELERATED = 8192  # the same on an accelerator, which takes nearly as long for one
 
 
 @dataclass(frozen=True)
@@ -203,14 +201,8 @@ def make_drives(vehicle: FreeVehicle, trials: tuple[Trial, ...], width: float | 
         room += ((names.index(DRAIN), 0.0),)
     courses = _courses(batch, room, shared)
     features = make_features(trials, bin_width(trials) if width is None else width, gyro)
-    paths = paths or PathReplay(vehicle.plant, lambda values: set_values(params, names, values),
-                                rows_of_call(10 * len(courses.first)))
+    paths = paths or PathReplay(vehicle.plant, lambda values: set_values(params, names, values))
     return Drives(trials, vehicle, paths, batch, courses, measured, features, features.of(measured))
-
-
-def rows_of_call(most: int = CHUNK) -> int:
-    """Drives of one replay call, on a processor at most so many."""
-    return min(CHUNK, most) if on_processor() else ACCELERATED
 
 
 def _courses(batch: Batch, room: tuple[tuple[int, float], ...], shared: bool) -> Courses:

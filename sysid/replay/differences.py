@@ -26,17 +26,13 @@ from sysid.errors.space import STEP, Space
 from sysid.logs.records import Trial
 from sysid.replay import pieces
 from sysid.replay.arrays import Quotients, namespace
-from sysid.replay.cores import on_processor
+from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.models import Parameters, set_parameters
 from sysid.replay.on_host import HostReplay
 from sysid.replay.records import ODOMETRY, POSE, TURN, Measured, Plant, Simulated
 from sysid.replay.rollout import PathReplay, Replay, make_batch, sent
 
-VECTOR, FEW, MANY = 8, 32, 128
-"""Drives that a core replays together fill its vectors, of so many numbers (20 take longer than 24), and are about so
-many for a few parameter sets, and for many: 1.7 ms a drive of 22 s with 32, 1.3 ms with 112, and no less with more."""
 AROUND = 0.1  # s, over which the speeds at the begin of a piece are averaged
-SETS = 4  # parameter sets together at least where courses alone fill vectors: as many as a search tries at once
 
 
 class CourseReplay:
@@ -69,7 +65,7 @@ class CourseReplay:
         whole = replace(batch, command=sent(command[first]), start=sent(from_start), **read)
         kind: Any = HostReplay if plant.host is not None and on_processor() else Replay
         self._replay = kind(plant, whole, set_values)
-        self.paths = paths or PathReplay(plant, set_values, rows_of_call(self.courses))
+        self.paths = paths or PathReplay(plant, set_values)
         self._traced, self.drives, self.states = self._replay, self.courses, self.courses * records
         self._trials = [trials[i] for i in first]
 
@@ -100,7 +96,9 @@ class CourseReplay:
         paths = paths.reshape(sets, courses, *paths.shape[1:])
         turned = paths[..., TURN] if self._replay.batch.gyro_index is not None else None
         path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)  # type: ignore[arg-type]
-        return self._spread(path)
+        # One by one: memory of many at once would be fetched from the system each time.
+        each = on_all_cores(lambda n: self._spread(jax.tree.map(lambda leaf: leaf[n : n + 1], path)), range(sets))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *each)
 
     def compile(self, parameters: int, trials: tuple[Trial, ...]) -> None:
         """Begin to compile what a processor needs to replay drives as long as these trials by so many parameters."""
@@ -129,11 +127,6 @@ class CourseReplay:
         rows = self._course[:, None] * values.shape[2] + index
         before, after = (xp.take(flat, one, axis=1) for one in (rows, rows + 1))  # ten times as fast as by two indices
         return before + weight[..., None] * (after - before)
-
-
-def rows_of_call(courses: int) -> int:
-    """Drives that a core replays at once: one number, since each is compiled; a multiple of `VECTOR`."""
-    return VECTOR * -(-min(max(SETS * courses, FEW), MANY) // VECTOR)
 
 
 def make_courses(plant: Plant, trials: tuple[Trial, ...], set_values: Callable[[jax.Array], Any],

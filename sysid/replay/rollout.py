@@ -37,6 +37,10 @@ from whill_mjx.processor import as_one_function
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
 
+ROWS = 96
+"""Drives that a core replays together: a step has as many loops for a few drives as for many. By drive 32 take twice as
+long and 160 nearly as long, but searches often try four parameter sets at once, on eight courses."""
+ACCELERATED = 8192  # the same on an accelerator, which takes nearly as long for one
 FETCHED = 512  # rows by which what an accelerator sends back grows: each size is compiled once
 ROOMS = (512, 1024, 2048, 4096)
 """Records for which one program has room, up to 41 s; longer drives have programs for multiples of the last."""
@@ -261,7 +265,9 @@ class PathReplay:
     It is compiled once for all batches; on an accelerator, for those of the same length.
     """
 
-    def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int):
+    def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int | None = None):
+        rows = rows or (ROWS if on_processor() else ACCELERATED)
+
         def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int, gyro: bool) -> jax.Array:
             return path_of(plant, set_values(values), Commanded(command, start, warm_up), rows <= IN_ONE, gyro)
 

@@ -14,7 +14,7 @@ from sysid.errors.space import FIXED
 from sysid.logs.records import CHANNEL_NAMES, Log
 from sysid.missing.catalogue import PARAMETER, base_values, hypotheses, outside_hypotheses, with_catalogue
 from sysid.missing.days import Reference
-from sysid.missing.drives import make_drives, rows_of_call
+from sysid.missing.drives import make_drives
 from sysid.missing.fit_statistics import FittedVehicle
 from sysid.missing.reference import BLOCK, make_reference, of_vehicle
 from sysid.missing.signatures import PARTS
@@ -45,7 +45,7 @@ def prepare(
         found += outside_hypotheses(spec, reference.params, reference.space.names)
     full = with_catalogue(reference.params, found)
     base = base_values(full)
-    paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values), rows_of_call())
+    paths = PathReplay(plant, lambda values: set_values(full, tuple(base), values))
     drives = make_drives(FreeVehicle(plant, full, tuple(base)), tuple(one.trial for one in reference.leftovers),
                          reference.width, paths, reference.gyro)
     drives = replace(drives, weight=np.stack([one.mask for one in reference.leftovers]))

@@ -11,8 +11,18 @@ import numpy as np
 import pytest
 
 from sysid import command_line as commands
+from whill_mjx import processor
 from whill_mjx.io import command_line
-from whill_mjx.processor import FLAG, OPTION, WIDE, as_one_function, share_results, shares_results
+from whill_mjx.processor import (
+    FLAG,
+    OPTION,
+    VECTORS,
+    WIDE,
+    as_one_function,
+    keep_results_apart,
+    share_results,
+    shares_results,
+)
 
 pytestmark = pytest.mark.quick
 
@@ -163,14 +173,32 @@ def test_commands_of_the_simulator_share_results(monkeypatch):
 
 
 def test_options_that_were_given_are_kept(monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     monkeypatch.setenv("XLA_FLAGS", f"--xla_cpu_max_isa=AVX2 {WIDE}=128")
     share_results()
-    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_max_isa=AVX2 {WIDE}=128 {FLAG}={OPTION}"
+    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_max_isa=AVX2 {WIDE}=128 {FLAG}={OPTION},{VECTORS}"
     share_results()
     assert os.environ["XLA_FLAGS"].count(OPTION) == 1
     monkeypatch.setenv("XLA_FLAGS", f"{FLAG}=xla_another_option {WIDE}=128")
     share_results()
     assert os.environ["XLA_FLAGS"] == f"{FLAG}=xla_another_option {WIDE}=128"
+
+
+@pytest.mark.parametrize(("asked", "device", "wanted"), [
+    ("", "", True), ("cpu", "nvidia0", True), ("", "nvidia0", False), ("cuda,cpu", "", False), ("", "accel0", False)])
+def test_llvm_is_asked_only_where_no_accelerator_reads_it_too(monkeypatch, tmp_path, asked, device, wanted):
+    monkeypatch.setenv("JAX_PLATFORMS", asked)
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(processor, "DEVICES", tmp_path)
+    if device:
+        (tmp_path / device).touch()
+    share_results()
+    assert shares_results() and (VECTORS in os.environ["XLA_FLAGS"]) == wanted
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # of a process that this one starts
+    share_results()
+    assert os.environ["XLA_FLAGS"].count(VECTORS) == os.environ["XLA_FLAGS"].count(FLAG) == 1
+    keep_results_apart()
+    assert not shares_results() and VECTORS not in os.environ["XLA_FLAGS"]
 
 
 def swinging(x, pushes):

@@ -10,6 +10,8 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
+from whill_mjx.processor import share_results, shares_results
+
 P = ParamSpec("P")
 R = TypeVar("R")
 PLATFORMS = "JAX_PLATFORMS"
@@ -25,7 +27,7 @@ def on_processor_apart(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) 
     """
     before = os.environ.get(PLATFORMS)
     os.environ[PLATFORMS] = "cpu"
-    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_leave_signals_to_the_parent)
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin)
     try:
         return pool.submit(call, *args, **kwargs).result()
     except BrokenProcessPool:
@@ -42,5 +44,8 @@ def on_processor_apart(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) 
             os.environ[PLATFORMS] = before
 
 
-def _leave_signals_to_the_parent() -> None:
+def _begin() -> None:
+    """Leave signals to the parent, and compile for the processor if it shares results (`whill_mjx.processor`)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if shares_results():
+        share_results()

@@ -47,6 +47,8 @@ STATIC_SAG = 0.005  # [m] suspension and tyre compression under the static load
 DAMPING_RATIO = 0.5  # [-] of the suspension
 LEAST_SAG = 8.0  # [m/s^2] times the squared physics step: with 3 instead, loads ring and wheels lose the floor
 LOAD_ROUNDS = 2  # in which loads and what wheels pull by them find together
+LOG1P = (0.999999966, -0.49999445, 0.333181217, -0.24835399, 0.190768807, -0.136022476, 0.0775160866, -0.0290740646,
+         0.00512610212)  # coefficients of log(1 + x) / x from 0 to 1, at Chebyshev's points
 SMOOTH_LOAD = 0.04  # share of the static load over which a contact loses it smoothly when it lifts
 
 
@@ -360,8 +362,16 @@ def rolling_axes(axes: jax.Array, drift: jax.Array | float) -> jax.Array:
 
 
 def softplus(value: jax.Array) -> jax.Array:
-    """log(1 + exp(value)), as `jax.nn.softplus` but of plain operations, which scalars.py can take apart."""
-    return jnp.maximum(value, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(value)))
+    """log(1 + exp(value)), as `jax.nn.softplus` but of plain operations, which scalars.py can take apart.
+
+    log(1 + small) / small is a polynomial, right to 4e-8: a processor takes six times as many operations for a
+    logarithm of any number, a fifth of a whole step.
+    """
+    small = jnp.exp(-jnp.abs(value))
+    ratio: jax.Array | float = 0.0
+    for coefficient in reversed(LOG1P):
+        ratio = ratio * small + coefficient
+    return jnp.maximum(value, 0.0) + small * ratio
 
 
 def suspension(
