@@ -52,7 +52,7 @@ class Days:
         days = NullDays(moments, np.tile(self.nulls.share, (len(added), 1)))
         worth = worth_on(days, Solver(self.evidence), self.hypotheses, self.wander)
         smallest = tails(self.scan.null, worth).min(1)
-        return np.array([family(self.scan.smallest, float(one)) for one in smallest]).reshape(-1, draws)
+        return family(self.scan.smallest, smallest).reshape(-1, draws)
 
     def noticed(self, alpha: float, effects: Sequence[Effect]) -> list[float]:
         """Of each effect the share of days on which something counts as missing."""

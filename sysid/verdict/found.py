@@ -78,11 +78,11 @@ class Scan:
     @property
     def p_family(self) -> float:
         """p-value of the smallest p-value."""
-        return family(self.smallest, float(self.p.min()))
+        return float(family(self.smallest, self.p.min()))
 
     def p_of(self, h: int, worth: float) -> float:
         """Family-wise p-value of hypothesis h if this is its worth."""
-        return family(self.smallest, float(tail(self.null[:, h], worth)))
+        return float(family(self.smallest, tail(self.null[:, h], worth)))
 
 
 def tail(null: np.ndarray, value: np.ndarray | float, least: float = 1e-9) -> np.ndarray:
@@ -102,13 +102,12 @@ def tails(null: np.ndarray, values: np.ndarray, least: float = 1e-9) -> np.ndarr
     return np.moveaxis(np.array(each).reshape(-1, *values.shape[:-1]), 0, -1)
 
 
-def family(smallest: np.ndarray, p: float) -> float:
-    """p-value of the smallest p among dependent tests, from its null sample; extrapolated as p x effective number."""
-    count = len(smallest)
-    if p >= np.quantile(smallest, 0.05):
-        return float((np.sum(smallest <= p) + 1) / (count + 1))
-    number = 0.05 / np.quantile(smallest, 0.05)
-    return float(min(1.0, number * p))
+def family(smallest: np.ndarray, p: np.ndarray | float) -> np.ndarray:
+    """p-values of p (...), the smallest of dependent tests, from its null sample (N,); extrapolated as p x effective
+    number."""
+    rare = np.quantile(smallest, 0.05)
+    share = (np.searchsorted(np.sort(smallest), p, side="right") + 1) / (len(smallest) + 1)
+    return np.where(p >= rare, share, np.minimum(0.05 / np.maximum(rare, 1e-300) * p, 1.0))
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,7 @@ class PairScan:
 
     def p_of(self, p: float) -> float:
         """Family-wise p-value of a pair's own."""
-        return family(self.smallest, p)
+        return float(family(self.smallest, p))
 
 
 @dataclass(frozen=True)
