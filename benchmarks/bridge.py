@@ -33,8 +33,8 @@ import numpy as np
 
 from benchmarks.bridge_faults import FAULTS, Figures, fault_rows, measure_faults
 from benchmarks.bridge_robot import environment_of
-from bridge.options import Parser, in_range, whole
-from bridge.simulated import Frame
+from bridge.nodes.options import Parser, in_range, whole
+from bridge.simulation.simulated import Frame
 from whill_mjx.io.command_line import guarded
 
 CLAIM = "Frame to command, delivery, pacing and every stop of the bridge, measured between processes"
@@ -217,7 +217,7 @@ def burners(count: int, cores: Sequence[int] = ()) -> Iterator[None]:
 
 def fuzz(count: int) -> tuple[int, int]:
     """Return how many commands of a supervisor left its limits, and its slew limits, of so many outputs of any bits."""
-    from bridge.safety import SafetyConfig, Supervisor
+    from bridge.safeguards.safety import SafetyConfig, Supervisor
 
     low, high, slew = np.array([-0.5, -1.0]), np.array([1.0, 1.0]), np.array([0.5, 1.0])
     plain = SafetyConfig((-0.5, -1.0), (1.0, 1.0))

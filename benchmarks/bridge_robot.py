@@ -129,7 +129,7 @@ class Robot:
     def camera(self, topic: str = "sensing/camera/front/image_raw", rate: float = 10,
                size: tuple[int, int] = (64, 64)) -> Any:
         """Publish images of one shade of grey, each different from the last unless `frozen`; return the timer."""
-        from bridge import ros
+        from bridge.nodes import ros
 
         image = message_type("sensor_msgs/Image")
         publisher = self.node.create_publisher(image, topic, ros.best_effort())

@@ -30,14 +30,14 @@ from benchmarks.bridge_faults import Figures
 from benchmarks.bridge_robot import environment_of
 from benchmarks.harness import record
 from bridge.episodes import PATIENCE
-from bridge.options import Parser, in_range, whole
-from bridge.simulated import Frame
+from bridge.nodes.options import Parser, in_range, whole
+from bridge.simulation.simulated import Frame
 from whill_mjx.io.command_line import guarded
 
 SENDER = """
 import sys, time, rclpy
 from nav_msgs.msg import Odometry
-from bridge import ros
+from bridge.nodes import ros
 rclpy.init()
 node = rclpy.create_node("sender")
 publisher = node.create_publisher(Odometry, "whill/odom", getattr(ros, sys.argv[1])(500))

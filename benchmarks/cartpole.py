@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks import cartpole_env, grid_env
 from benchmarks.harness import figure, record
-from bridge.options import Parser, in_range, whole
+from bridge.nodes.options import Parser, in_range, whole
 from dreamer import spaces
 from dreamer.config import DreamerConfig, preset
 from dreamer.evaluate import Rounds, evaluate

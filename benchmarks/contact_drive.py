@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.harness import figure, record
 from benchmarks.physics import CLAIM
 from benchmarks.plant.make import Experiment, make_log
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from sysid.logs.log import load_log
 from sysid.logs.records import Log
 from sysid.search.fitting import fit_log, predict

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.course_figures import BLIND, draw, groups, is_corridor, last_evaluation, load_run
 from benchmarks.harness import RESULTS, device_name, figure, record
-from bridge.options import Parser, in_range, whole
+from bridge.nodes.options import Parser, in_range, whole
 from dreamer.config import PRESETS
 from dreamer.config import preset as learner_preset
 from dreamer.evaluate import evaluate

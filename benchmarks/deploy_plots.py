@@ -19,8 +19,8 @@ from benchmarks.loop_drives import Plan
 from benchmarks.page_pictures import save_figure
 from benchmarks.pictures import IMAGES
 from benchmarks.plant.chair import VEHICLES
-from bridge.options import Parser
-from bridge.trial_writer import COLUMNS
+from bridge.nodes.options import Parser
+from bridge.recording.trial_writer import COLUMNS
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.folders import check_file
 

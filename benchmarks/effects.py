@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx import share_results
 from whill_mjx.effects import EFFECTS, equation, make_effect
 from whill_mjx.effects.base import PLACES, Effect, place_of

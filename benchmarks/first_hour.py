@@ -18,7 +18,7 @@ from pathlib import Path
 
 from benchmarks.harness import RESULTS, figure, record
 from benchmarks.tutorials import CLAIM, ROOT, surroundings, workplace
-from bridge.options import Parser, in_range
+from bridge.nodes.options import Parser, in_range
 from whill_mjx import __version__
 from whill_mjx.io.command_line import guarded
 

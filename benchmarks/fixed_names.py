@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.harness import RESULTS, figure, provenance
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx.io.command_line import guarded
 from whill_mjx.logs.dataset import write_json
 

@@ -26,7 +26,7 @@ from statistics import median
 from benchmarks.harness import figure, record
 from benchmarks.import_graph import circles, floors, import_graph
 from benchmarks.prose import sentences
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
 ROOT = Path(__file__).parents[1]

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from benchmarks import harness, learner_study
 from benchmarks.learner_updates import ACTION_DIM, OBS_SHAPE, ROWS, STREAMS, random_replay, time_updates
-from bridge.options import Parser, in_range, whole
+from bridge.nodes.options import Parser, in_range, whole
 from dreamer import agent as agents
 from dreamer import behavior, distributions, image, optim, replay, rssm, world_model
 from dreamer.config import DreamerConfig, preset

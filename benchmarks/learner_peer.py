@@ -14,7 +14,7 @@ import json
 import time
 from typing import Any
 
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
 LENGTH = 64

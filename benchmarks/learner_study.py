@@ -38,7 +38,7 @@ import jax.numpy as jnp
 
 from benchmarks import harness, learner_fused, learner_profile
 from benchmarks.learner_updates import Updates
-from bridge.options import in_range, whole
+from bridge.nodes.options import in_range, whole
 from dreamer import distributions, recurrence, rssm
 from dreamer.config import DreamerConfig
 from dreamer.rssm import Latent

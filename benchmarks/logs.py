@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.harness import figure, record
 from benchmarks.log_faults import FAULTS, ROOT, Drive, Fault, Robot, healthy
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
 CLAIM = "Strangers' logs and robots: faults that are named, calibration, robot files that load."

@@ -17,9 +17,9 @@ from benchmarks.plant.chair import Nominal
 from benchmarks.plant.make import Experiment
 from benchmarks.plant.make import plan as plan_day
 from benchmarks.plant.online import OnlinePlant
-from bridge.command_table import PERIOD, CommandTable, make_table, read_commands
-from bridge.dataset_file import write_dataset_file
-from bridge.trial_writer import TrialWriter
+from bridge.driving.command_table import PERIOD, CommandTable, make_table, read_commands
+from bridge.recording.dataset_file import write_dataset_file
+from bridge.recording.trial_writer import TrialWriter
 
 LIMITS = (2.0, 4.0)
 """Of the commands [m/s, rad/s], as those of `bridge.manoeuvre`."""

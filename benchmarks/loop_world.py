@@ -15,7 +15,7 @@ from benchmarks.plant.base import TICK
 from benchmarks.plant.draw import draw_effect
 from benchmarks.plant.make import Experiment, plan
 from benchmarks.plant.online import OnlinePlant
-from bridge.moved_simulator import MovedSimulator
+from bridge.simulation.moved_simulator import MovedSimulator
 
 
 class PlantMover:
@@ -53,7 +53,7 @@ def contact_vehicle(task: str = "corridor", vehicle: str | Path | None = None, s
     """One contact plant that drives episodes of a task.
 
     Args:
-        task, vehicle, size, changes: as of `bridge.chair_simulator.ChairSimulator`.
+        task, vehicle, size, changes: as of `bridge.simulation.chair_simulator.ChairSimulator`.
         plant_seed: of the day.
         draw: number that draws the effect in the plant; None: no effect.
     """

@@ -11,7 +11,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from benchmarks.harness import RESULTS
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.reading import read_json
 

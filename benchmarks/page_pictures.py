@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.pictures import IMAGES, write_film
 from benchmarks.task_pages import worlds
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.folders import whole_file
 from whill_mjx.tasks.options import named_task

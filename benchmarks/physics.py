@@ -29,7 +29,7 @@ import numpy as np
 
 from benchmarks.harness import figure, record, time_calls
 from benchmarks.physics_rolls import BASE, compiled_roll
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from whill_mjx.effects import EFFECTS
 from whill_mjx.io.command_line import guarded
 from whill_mjx.logs.manoeuvres import command_table

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx.io.command_line import guarded
 from whill_mjx.logs.dataset import write_text
 

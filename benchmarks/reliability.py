@@ -42,7 +42,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from benchmarks.harness import RESULTS, device_name, figure, provenance, record
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.reading import read_json

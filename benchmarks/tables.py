@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.claims import CLAIMS, HEADLINES, Claim
 from benchmarks.harness import RESULTS
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx.io.command_line import guarded
 
 HEAD = """# Benchmarks

@@ -14,7 +14,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx.io.command_line import guarded
 from whill_mjx.io.folders import write_whole
 from whill_mjx.tasks.base import Task

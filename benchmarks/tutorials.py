@@ -31,7 +31,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bridge.options import Parser
+from bridge.nodes.options import Parser
 from whill_mjx.io.command_line import guarded
 
 ROOT = Path(__file__).parent.parent

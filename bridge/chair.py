@@ -12,11 +12,11 @@ import sys
 import time
 from typing import Any
 
-from bridge import ros
-from bridge.exits import Exit
-from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
-from bridge.parameters import command_line
-from bridge.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
+from bridge.driving.whill import TREAD, WHEEL_RADIUS, ChairState, WheelOdometry
+from bridge.nodes import ros
+from bridge.nodes.exits import Exit
+from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, topic_name
+from bridge.nodes.parameters import command_line
 
 SLOW = 0.15
 """Interval of states [s] above which odometry is too coarse to identify a vehicle from."""

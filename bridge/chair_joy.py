@@ -16,11 +16,11 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from bridge import ros
-from bridge.bases import WHILL
-from bridge.exits import Exit
-from bridge.options import Parser, ends_at_ctrl_c, in_range, topic_name
-from bridge.parameters import command_line
+from bridge.driving.bases import WHILL
+from bridge.nodes import ros
+from bridge.nodes.exits import Exit
+from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, topic_name
+from bridge.nodes.parameters import command_line
 
 JOY_TOPIC = "whill/controller/joy"
 STEPS = 100

@@ -11,16 +11,16 @@ import math
 import sys
 from pathlib import Path
 
-from bridge import parameters, ros, scheduling
-from bridge.bases import BASES
-from bridge.controller import Caution, Controller
-from bridge.drive_node import DriveNode
-from bridge.exits import Exit, OptionError, refusal
-from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
+from bridge.driving.bases import BASES
+from bridge.driving.controller import Caution, Controller
+from bridge.driving.drive_node import DriveNode
+from bridge.driving.vehicle_node import add_options, limits
+from bridge.nodes import parameters, ros, scheduling
+from bridge.nodes.exits import Exit, OptionError, refusal
+from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, result_file, topic_name, whole
 from bridge.policy import Policy
-from bridge.safety import SafetyConfig
-from bridge.vehicle_node import add_options, limits
-from bridge.view import view_of
+from bridge.safeguards.safety import SafetyConfig
+from bridge.sensing.view import view_of
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:

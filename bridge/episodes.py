@@ -28,7 +28,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from bridge.exits import OptionError
+from bridge.nodes.exits import OptionError
 
 PROTOCOL = 1
 LARGEST = 65536

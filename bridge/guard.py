@@ -4,18 +4,18 @@
 
 `bridge.drive` starts one by itself. The two exchange heartbeats: the policy node says whether it drives, the guard says
 whom it hears and that its zeros would reach the base; without that the policy node does not drive. When a driving node
-gives no sign of life for SILENCE seconds (`bridge/watchdog.py`), the guard publishes zeros. It never publishes anything
-else.
+gives no sign of life for SILENCE seconds (`bridge/safeguards/watchdog.py`), the guard publishes zeros. It never
+publishes anything else.
 """
 
 import argparse
 import sys
 
-from bridge import ros
-from bridge.exits import Exit
-from bridge.guard_node import GuardNode
-from bridge.options import Parser, ends_at_ctrl_c, topic_name, whole
-from bridge.parameters import command_line
+from bridge.nodes import ros
+from bridge.nodes.exits import Exit
+from bridge.nodes.options import Parser, ends_at_ctrl_c, topic_name, whole
+from bridge.nodes.parameters import command_line
+from bridge.safeguards.guard_node import GuardNode
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:

@@ -13,18 +13,18 @@ import math
 import sys
 from pathlib import Path
 
-from bridge import parameters, ros
-from bridge.bases import BASES
-from bridge.command_table import CommandTable, check_space, make_table, reach_of, read_commands
-from bridge.dataset_file import add_dataset_options, check_dataset, write_dataset_file
-from bridge.exits import Exit, OptionError, refusal
-from bridge.fitted_reach import simulate_reach
-from bridge.manoeuvre_node import ManoeuvreNode
-from bridge.options import Parser, ends_at_ctrl_c, in_range, said, whole
-from bridge.player import Player
-from bridge.safety import SafetyConfig
-from bridge.trial_writer import TrialWriter
-from bridge.vehicle_node import add_options, limits
+from bridge.driving.bases import BASES
+from bridge.driving.command_table import CommandTable, check_space, make_table, reach_of, read_commands
+from bridge.driving.fitted_reach import simulate_reach
+from bridge.driving.manoeuvre_node import ManoeuvreNode
+from bridge.driving.player import Player
+from bridge.driving.vehicle_node import add_options, limits
+from bridge.nodes import parameters, ros
+from bridge.nodes.exits import Exit, OptionError, refusal
+from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, said, whole
+from bridge.recording.dataset_file import add_dataset_options, check_dataset, write_dataset_file
+from bridge.recording.trial_writer import TrialWriter
+from bridge.safeguards.safety import SafetyConfig
 
 NAME = "bridge.manoeuvre"
 WIDEST = (2.0, 4.0)

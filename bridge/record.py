@@ -15,15 +15,15 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from bridge import ros
-from bridge.dataset_file import add_dataset_options, check_dataset, write_dataset_file
-from bridge.exits import Exit, refusal
-from bridge.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
-from bridge.parameters import command_line
-from bridge.record_node import RecordNode
-from bridge.recovery import recover
-from bridge.split_writer import SplitWriter
-from bridge.trial_writer import PARTIAL, TrialWriter
+from bridge.nodes import ros
+from bridge.nodes.exits import Exit, refusal
+from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, said, topic_name
+from bridge.nodes.parameters import command_line
+from bridge.recording.dataset_file import add_dataset_options, check_dataset, write_dataset_file
+from bridge.recording.record_node import RecordNode
+from bridge.recording.recovery import recover
+from bridge.recording.split_writer import SplitWriter
+from bridge.recording.trial_writer import PARTIAL, TrialWriter
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:

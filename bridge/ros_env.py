@@ -14,12 +14,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from bridge import ros
-from bridge.commands import CommandTopic
 from bridge.episodes import EpisodeClient
-from bridge.image import to_rgb8
-from bridge.safety import SafetyConfig
-from bridge.senses import AGE
+from bridge.nodes import ros
+from bridge.nodes.commands import CommandTopic
+from bridge.safeguards.safety import SafetyConfig
+from bridge.sensing.image import to_rgb8
+from bridge.sensing.senses import AGE
 
 PATIENCE = 5.0
 """Seconds without the image that is waited for."""

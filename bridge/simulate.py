@@ -18,14 +18,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bridge import ros
 from bridge.episodes import EpisodeServer
-from bridge.exits import Exit
-from bridge.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
-from bridge.parameters import command_line
+from bridge.nodes import ros
+from bridge.nodes.exits import Exit
+from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, result_file, whole
+from bridge.nodes.parameters import command_line
 from bridge.policy import PolicyFileError
-from bridge.simulate_node import RESULTS, SimulateNode
-from bridge.simulator_choice import SIMULATOR, make_vehicle
+from bridge.simulation.simulate_node import RESULTS, SimulateNode
+from bridge.simulation.simulator_choice import SIMULATOR, make_vehicle
 
 TOKEN_VARIABLE = "BRIDGE_TOKEN"
 """Environment variable with the token of episode control; on a command line everybody could read it."""

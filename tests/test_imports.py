@@ -24,9 +24,9 @@ DOORS = {
 ROOMS = {"whill_mjx/learning": {"dreamer"}}  # belongs to the first
 FILES = {  # belong to the first, and to the second
     "whill_mjx/learning/vehicle_of_run.py": {"sysid"},
-    "bridge/chair_simulator.py": {"whill_mjx"},
-    "bridge/moved_simulator.py": {"whill_mjx"},
-    "bridge/simulator_choice.py": {"whill_mjx", "sysid"},
+    "bridge/simulation/chair_simulator.py": {"whill_mjx"},
+    "bridge/simulation/moved_simulator.py": {"whill_mjx"},
+    "bridge/simulation/simulator_choice.py": {"whill_mjx", "sysid"},
 }
 
 READER = "bridge.policy"

@@ -15,7 +15,7 @@ import pytest
 
 from bridge import chair, guard, record, simulate
 from bridge import drive as bridge_drive
-from bridge.exits import Exit
+from bridge.nodes.exits import Exit
 from sysid import close_loop, convert, design, fit, inspect, paper, report, searches
 from sysid.logs.conversion import ConvertConfig
 from sysid.pages.paper_page import PaperConfig

@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.foreign.drivers import CONTROLS, WITH_STOP, load
 from benchmarks.foreign.room import VARIANTS
 from benchmarks.foreign.run import Job, drive_all
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
 

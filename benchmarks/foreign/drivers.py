@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.foreign.drive import PERIOD, Pose
 from benchmarks.foreign.room import AHEAD, BEGIN, END, GOAL, WIDTH, Room
-from bridge.safety import SafetyConfig
+from bridge.safeguards.safety import SafetyConfig
 
 CONTROLS = ("planner", "straight", "blank", "frozen")
 """A planner that knows the truth, straight ahead, and the policy with black images or its first one kept."""

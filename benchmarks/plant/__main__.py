@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import Experiment, make_log
-from bridge.options import Parser, in_range, whole
+from bridge.nodes.options import Parser, in_range, whole
 from whill_mjx.io.command_line import OptionError, guarded
 from whill_mjx.io.heartbeat import Heartbeat
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.plant.make import Experiment, make_log
-from bridge.options import Parser, whole
+from bridge.nodes.options import Parser, whole
 from whill_mjx.io.command_line import guarded
 
 CHANNELS = ("v", "omega", "yaw", "x", "y", "pose_yaw", "pose_x", "pose_y")

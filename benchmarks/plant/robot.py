@@ -29,9 +29,9 @@ from benchmarks.plant.draw import draw_effect
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import Experiment, plan
 from benchmarks.plant.online import OnlinePlant
-from bridge import ros
 from bridge.episodes import PROTOCOL, Calls, EpisodeServer, number
-from bridge.options import Parser, in_range, result_file, whole
+from bridge.nodes import ros
+from bridge.nodes.options import Parser, in_range, result_file, whole
 
 STEP = 0.05
 """Seconds between two messages on /clock, two reports, and two commands of a driver.

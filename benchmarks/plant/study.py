@@ -17,7 +17,7 @@ from benchmarks.plant.commands import nine
 from benchmarks.plant.compare import CHANNELS, drive_like, groups, read, spread
 from benchmarks.plant.effects import EFFECTS
 from benchmarks.plant.make import Experiment, drive_all, plan
-from bridge.options import Parser, in_range
+from bridge.nodes.options import Parser, in_range
 from whill_mjx.io.command_line import guarded
 
 

@@ -146,8 +146,8 @@ class Policy:
     def step(self, seen: np.ndarray | Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the command (2,): v [m/s], omega [rad/s], for an image (H, W, 3) uint8 rgb8, or observations by name.
 
-        The command is not limited here (bridge/safety.py does), and it is NaN where the action or the new state is
-        not finite: a spoilt state must never hide behind a finite action.
+        The command is not limited here (`bridge/safeguards/safety.py` does), and it is NaN where the action or the new
+        state is not finite: a spoilt state must never hide behind a finite action.
 
         Raises:
             ValueError: an observation is missing or has another shape or dtype than the policy was trained with.
@@ -158,7 +158,7 @@ class Policy:
             if value is None or value.shape != want.shape or value.dtype != want.dtype:
                 found = "none" if value is None else f"{value.shape} {value.dtype}"
                 raise ValueError(f"{self.name}: {name} is {found}; the policy needs {want.shape} {want.dtype}. Convert "
-                                 "it (an image: bridge.image.to_rgb8).")
+                                 "it (an image: bridge.sensing.image.to_rgb8).")
         self.prepare()
         assert self._early is not None
         results = self._network.late({name: given[name] for name in self._inputs}, self._state(), self._early)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks import deploy_plots
-from bridge.trial_writer import COLUMNS
+from bridge.recording.trial_writer import COLUMNS
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ for 200 ms, ignores the rider's joystick meanwhile, and changes its speed by abo
 
 import math
 
-from bridge.bases import WHILL
-from bridge.whill import KMH, TREAD, WHEEL_RADIUS, ChairState, command_of_words, command_words
+from bridge.driving.bases import WHILL
+from bridge.driving.whill import KMH, TREAD, WHEEL_RADIUS, ChairState, command_of_words, command_words
 
 RAMP = 1.7
 """[m/s2]"""

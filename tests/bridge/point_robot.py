@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from bridge.policy import SensorInput
-from bridge.simulated import Frame, Grid
+from bridge.simulation.simulated import Frame, Grid
 
 
 class PointRobot:

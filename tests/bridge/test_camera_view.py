@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from bridge.image import ImageError, RawImage, area_resize
 from bridge.policy import SensorInput
-from bridge.view import Calibration, Rectifier, read_calibration, view_of
+from bridge.sensing.image import ImageError, RawImage, area_resize
+from bridge.sensing.view import Calibration, Rectifier, read_calibration, view_of
 
 pytestmark = pytest.mark.quick
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.plant.first_day import write_urdf
-from bridge.chair_simulator import ChairSimulator
 from bridge.simulate import field, parse_arguments
-from bridge.simulated import halfway
-from bridge.simulator_choice import make_vehicle
+from bridge.simulation.chair_simulator import ChairSimulator
+from bridge.simulation.simulated import halfway
+from bridge.simulation.simulator_choice import make_vehicle
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bridge.command_table import PERIOD, check_space, make_table, reach_of, read_commands
+from bridge.driving.command_table import PERIOD, check_space, make_table, reach_of, read_commands
 from bridge.manoeuvre import main, parse_arguments, prepare
 
 pytestmark = pytest.mark.quick

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from bridge.commands import (
+from bridge.nodes.commands import (
     NAMELESS,
     UNKNOWN,
     Commanders,
@@ -101,7 +101,7 @@ def test_second_node_of_the_same_name_is_somebody_else():
 def test_neither_the_bridges_own_nodes_nor_one_without_a_name_yet_is_a_base(monkeypatch):
     names = [("/", "bridge_drive"), ("/", "bridge_guard"), ("/", "bridge_guard"), ("/", "bridge_record"),
              ("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_"), ("/left", "bridge_guard"), ("/", "base")]
-    monkeypatch.setattr("bridge.commands.ros.hears_commands", lambda requested: True)
+    monkeypatch.setattr("bridge.nodes.commands.ros.hears_commands", lambda requested: True)
     infos = [types.SimpleNamespace(node_namespace=space, node_name=name, topic_type=TWIST, qos_profile=None)
              for space, name in names]
     node = types.SimpleNamespace(

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bridge.controller import Caution, Controller
+from bridge.driving.controller import Caution, Controller
 from bridge.policy import SensorInput
-from bridge.safety import SafetyConfig
+from bridge.safeguards.safety import SafetyConfig
 
 pytestmark = pytest.mark.quick
 

@@ -12,14 +12,14 @@ from damaged_bytes import check, damaged
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.command_table import make_table, read_commands
+from bridge.driving.command_table import make_table, read_commands
 from bridge.episodes import LENGTH, EpisodeServer, ProtocolError, encode, number, receive
-from bridge.heartbeat import read_beat
-from bridge.image import ImageError, compressed_to_rgb8
-from bridge.mcap_file import HEAD, MAGIC, _end, mend
-from bridge.parameters import as_options
-from bridge.recovery import recover
-from bridge.view import read_calibration
+from bridge.nodes.parameters import as_options
+from bridge.recording.mcap_file import HEAD, MAGIC, _end, mend
+from bridge.recording.recovery import recover
+from bridge.safeguards.heartbeat import read_beat
+from bridge.sensing.image import ImageError, compressed_to_rgb8
+from bridge.sensing.view import read_calibration
 
 pytestmark = pytest.mark.quick
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from ros_graph import commands_per_period
 
-from bridge.exits import Exit
+from bridge.nodes.exits import Exit
 
 
 def column(path, name):

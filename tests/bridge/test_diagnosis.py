@@ -4,11 +4,11 @@ import dataclasses
 
 import pytest
 
-from bridge.commands import Endpoint
-from bridge.diagnosis import Evidence, FrameLog, causes, input_cause, is_mixed
+from bridge.driving.diagnosis import Evidence, FrameLog, causes, input_cause, is_mixed
+from bridge.nodes.commands import Endpoint
 from bridge.policy import SensorInput
-from bridge.sense_topics import topics_of
-from bridge.senses import Stream
+from bridge.sensing.sense_topics import topics_of
+from bridge.sensing.senses import Stream
 
 pytestmark = pytest.mark.quick
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

@@ -59,7 +59,7 @@ def test_base_that_is_gone_is_named(graph, policy):
 
 
 def test_base_whose_quality_of_service_does_not_fit_is_named_and_nothing_drives(graph, policy):
-    from bridge import ros
+    from bridge.nodes import ros
 
     robot = graph.peer("robot")
     robot.watch(), robot.camera(), robot.e_stop()
@@ -160,7 +160,7 @@ def test_lifecycle_node_keeps_its_hold_where_activation_fails(graph, monkeypatch
     from rclpy.lifecycle import LifecycleNode
     from rclpy.lifecycle import TransitionCallbackReturn as Result
 
-    from bridge import ros
+    from bridge.nodes import ros
 
     monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
     changes = []

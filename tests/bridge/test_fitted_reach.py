@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge import fitted_reach
+from bridge.driving import fitted_reach
 from bridge.manoeuvre import main
 
 pytestmark = pytest.mark.quick

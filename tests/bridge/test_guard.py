@@ -8,13 +8,13 @@ import types
 
 import pytest
 
-from bridge import ros
-from bridge.commands import CommandTopic, Endpoint
-from bridge.guard_link import GuardLink
-from bridge.guard_node import GuardNode
-from bridge.heartbeat import read_beat
-from bridge.vehicle_node import VehicleNode
-from bridge.watchdog import Watchdog
+from bridge.driving.vehicle_node import VehicleNode
+from bridge.nodes import ros
+from bridge.nodes.commands import CommandTopic, Endpoint
+from bridge.safeguards.guard_link import GuardLink
+from bridge.safeguards.guard_node import GuardNode
+from bridge.safeguards.heartbeat import read_beat
+from bridge.safeguards.watchdog import Watchdog
 
 pytestmark = pytest.mark.quick
 

@@ -48,10 +48,13 @@ import json, sys, time, types
 import humble_stub
 humble_stub.install()
 import numpy as np
-from bridge import commands, drive, drive_node, guard, guard_node, vehicle_node
-from bridge.controller import Controller
+from bridge.nodes import commands
+from bridge import drive, guard
+from bridge.driving import drive_node, vehicle_node
+from bridge.safeguards import guard_node
+from bridge.driving.controller import Controller
 from bridge.policy import SensorInput
-from bridge.safety import SafetyConfig
+from bridge.safeguards.safety import SafetyConfig
 
 class Policy:
     contract = commands = types.SimpleNamespace(rate_hz=200.0, action_repeat=1)

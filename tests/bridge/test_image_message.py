@@ -6,8 +6,16 @@ import io
 import numpy as np
 import pytest
 
-from bridge import image as image_module
-from bridge.image import CHANNELS, ImageError, RawImage, area_resize, compressed_to_rgb8, pillow_decoder, to_rgb8
+from bridge.sensing import image as image_module
+from bridge.sensing.image import (
+    CHANNELS,
+    ImageError,
+    RawImage,
+    area_resize,
+    compressed_to_rgb8,
+    pillow_decoder,
+    to_rgb8,
+)
 
 pytestmark = pytest.mark.quick
 RED, BLUE = (255, 0, 0), (0, 0, 255)

@@ -5,8 +5,8 @@ import argparse
 import numpy as np
 import pytest
 
-from bridge.inputs import SafetyInputs, Signal, add_options
-from bridge.safety import SafetyConfig, State, Supervisor
+from bridge.safeguards.inputs import SafetyInputs, Signal, add_options
+from bridge.safeguards.safety import SafetyConfig, State, Supervisor
 
 pytestmark = pytest.mark.quick
 

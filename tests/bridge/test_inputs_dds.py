@@ -8,7 +8,7 @@ from benchmarks.bridge_robot import message_type
 
 
 def latched_profile():
-    from bridge import ros
+    from bridge.nodes import ros
 
     return ros.latched()
 
@@ -49,7 +49,7 @@ def test_pulled_emergency_stop_ends_the_drive_until_it_is_released_and_armed(gra
 
 
 def test_collision_that_a_best_effort_sensor_reports_stops_the_drive(graph, policy):
-    from bridge import ros
+    from bridge.nodes import ros
 
     robot = graph.peer("robot")
     robot.whole()

@@ -3,10 +3,10 @@
 import pytest
 
 from bridge.drive import main
-from bridge.exits import Exit
-from bridge.joystick_lock import AGAIN, NOT_LOCKED, JoystickLock
-from bridge.safety import SafetyConfig, Supervisor
-from bridge.watchdog import FORGET, Watchdog
+from bridge.nodes.exits import Exit
+from bridge.safeguards.joystick_lock import AGAIN, NOT_LOCKED, JoystickLock
+from bridge.safeguards.safety import SafetyConfig, Supervisor
+from bridge.safeguards.watchdog import FORGET, Watchdog
 
 pytestmark = pytest.mark.quick
 

@@ -5,8 +5,8 @@ import signal
 import pytest
 
 from benchmarks.bridge_robot import message_type
-from bridge.mcap_file import McapWriter, definition_of, mend, stamp_of
-from bridge.trial_writer import MCAP
+from bridge.recording.mcap_file import McapWriter, definition_of, mend, stamp_of
+from bridge.recording.trial_writer import MCAP
 
 pytest.importorskip("rclpy")
 

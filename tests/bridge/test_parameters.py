@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from bridge.drive import parse_arguments
-from bridge.parameters import command_line, with_options
+from bridge.nodes.parameters import command_line, with_options
 
 pytest.importorskip("yaml")
 pytestmark = pytest.mark.quick

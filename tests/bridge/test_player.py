@@ -7,11 +7,11 @@ import sys
 import numpy as np
 import pytest
 
-from bridge.command_table import make_table
-from bridge.manoeuvre_node import _enter_was_pressed
-from bridge.player import BACK, FINISHED, Player
-from bridge.safety import SafetyConfig
-from bridge.vehicle_time import VehicleTime
+from bridge.driving.command_table import make_table
+from bridge.driving.manoeuvre_node import _enter_was_pressed
+from bridge.driving.player import BACK, FINISHED, Player
+from bridge.driving.vehicle_time import VehicleTime
+from bridge.safeguards.safety import SafetyConfig
 
 pytestmark = pytest.mark.quick
 

@@ -118,7 +118,7 @@ class Block:
 sys.meta_path.insert(0, Block())
 import numpy as np
 from bridge.policy import Policy
-from bridge.controller import Controller
+from bridge.driving.controller import Controller
 print(Policy.load(sys.argv[1]).step(np.full((8, 8, 3), 255, np.uint8)).round(6).tolist())
 """
     done = subprocess.run([sys.executable, "-c", code, str(folder)], cwd=ROOT, capture_output=True, text=True,

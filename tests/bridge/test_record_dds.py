@@ -45,7 +45,7 @@ def recorded(folder):
 
 @pytest.mark.parametrize("kind", ["reliable", "best_effort"])
 def test_every_message_of_a_burst_is_recorded_once(graph, tmp_path, kind):
-    from bridge import ros
+    from bridge.nodes import ros
 
     peer = graph.peer()
     publisher = peer.publisher("nav_msgs/Odometry", "whill/odom", getattr(ros, kind)(500))
@@ -60,7 +60,7 @@ def test_every_message_of_a_burst_is_recorded_once(graph, tmp_path, kind):
 
 
 def test_best_effort_publisher_that_joins_a_reliable_one_is_heard_too(graph, tmp_path):
-    from bridge import ros
+    from bridge.nodes import ros
 
     peer = graph.peer()
     first = peer.publisher("nav_msgs/Odometry", "whill/odom", ros.reliable(500))

@@ -9,13 +9,13 @@ import tomllib
 
 import pytest
 
-from bridge.dataset_file import toml_text, write_dataset_file
-from bridge.exits import Exit
+from bridge.nodes.exits import Exit
+from bridge.nodes.ros import PROFILE, split_ros_arguments, use_dds_profile
 from bridge.record import finish, main, parse_arguments
-from bridge.record_node import believed
-from bridge.ros import PROFILE, split_ros_arguments, use_dds_profile
-from bridge.split_writer import SplitWriter
-from bridge.trial_writer import TrialWriter
+from bridge.recording.dataset_file import toml_text, write_dataset_file
+from bridge.recording.record_node import believed
+from bridge.recording.split_writer import SplitWriter
+from bridge.recording.trial_writer import TrialWriter
 
 pytestmark = pytest.mark.quick
 
@@ -109,7 +109,7 @@ def test_a_split_recording_without_motion_writes_no_trial_and_one_that_goes_sile
 def test_whole_messages_of_a_standstill_wait_on_disk_and_keep_their_time_of_receipt(tmp_path, monkeypatch):
     """An hour of images before a drive: the trial has those of its last three seconds, and the memory none."""
     now, kept = [0.0], []
-    monkeypatch.setattr("bridge.split_writer.time.time_ns", lambda: int(now[0] * 1e9))
+    monkeypatch.setattr("bridge.recording.split_writer.time.time_ns", lambda: int(now[0] * 1e9))
     monkeypatch.setattr(TrialWriter, "message", lambda self, *message: kept.append(message))
     writer = SplitWriter(tmp_path, "walk", 3.0, lambda folder, rows: None, lambda: now[0])
     for i in range(3600):

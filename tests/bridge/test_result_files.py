@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from bridge.options import result_file
-from bridge.simulate_node import RESULTS, SimulateNode
+from bridge.nodes.options import result_file
+from bridge.simulation.simulate_node import RESULTS, SimulateNode
 
 pytestmark = pytest.mark.quick
 

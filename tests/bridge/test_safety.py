@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.safety import EDGES, Event, SafetyConfig, State, Supervisor
+from bridge.safeguards.safety import EDGES, Event, SafetyConfig, State, Supervisor
 
 CONFIG = SafetyConfig(low=(-0.5, -1.0), high=(1.0, 1.0))
 GO = np.array([0.4, 0.2])

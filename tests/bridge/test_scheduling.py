@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tiny_policy import write
 
-from bridge import scheduling
+from bridge.nodes import scheduling
 from bridge.policy import Policy
 
 pytestmark = pytest.mark.quick

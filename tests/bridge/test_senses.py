@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import tiny_policy
 
-from bridge.controller import Controller
 from bridge.drive import main
-from bridge.exits import Exit
+from bridge.driving.controller import Controller
+from bridge.nodes.exits import Exit
 from bridge.policy import Policy, PolicyFileError, SensorInput
-from bridge.safety import SafetyConfig, Supervisor
-from bridge.sense_topics import reader_of
-from bridge.senses import Scan, SenseError, Senses, rays_of
+from bridge.safeguards.safety import SafetyConfig, Supervisor
+from bridge.sensing.sense_topics import reader_of
+from bridge.sensing.senses import Scan, SenseError, Senses, rays_of
 
 pytestmark = pytest.mark.quick
 LIDAR = SensorInput("lidar", "lidar", (4,), {"reach": 8.0})

@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from benchmarks.bridge_robot import message_type
-from bridge.simulate_node import SimulateNode
-from bridge.simulated import SimulatedClock
-from bridge.simulated_messages import between, planar_covariance
+from bridge.simulation.simulate_node import SimulateNode
+from bridge.simulation.simulated import SimulatedClock
+from bridge.simulation.simulated_messages import between, planar_covariance
 
 
 def listen(peer, kind, topic, profile=10):
@@ -52,7 +52,7 @@ def test_default_subscribers_hear_every_topic_and_find_it_filled(graph):
 
 
 def latched():
-    from bridge import ros
+    from bridge.nodes import ros
 
     return ros.latched()
 
@@ -105,7 +105,7 @@ def test_the_shipped_layouts_show_topics_that_the_simulator_publishes_in_their_t
 
 
 def test_best_effort_subscribers_are_served_too(graph):
-    from bridge import ros
+    from bridge.nodes import ros
 
     peer = graph.peer()
     heard = [listen(peer, kind, topic, ros.best_effort()) for kind, topic in
@@ -188,7 +188,7 @@ def test_simulator_says_when_it_is_ready_where_it_listens_and_how_an_episode_end
 def test_the_simulator_says_that_it_is_ready_when_its_topics_are_there(monkeypatch):
     pytest.importorskip("rclpy")
     calls = MagicMock()
-    monkeypatch.setattr("bridge.simulate_node.ros", calls.ros)
+    monkeypatch.setattr("bridge.simulation.simulate_node.ros", calls.ros)
     calls.node.resolve_topic_name.return_value = "/cmd_vel"
     vehicle = SimpleNamespace(period=0.1, reset=lambda seed: None, step=lambda v, omega: None)
     options = SimpleNamespace(seed=0, speed=1.0, clock=True, command_type="Twist")

@@ -50,8 +50,8 @@ def odometry(x):
 
 
 def test_messages_of_one_stamp_are_each_recorded():
-    from bridge import ros
-    from bridge.streams import Stream
+    from bridge.nodes import ros
+    from bridge.nodes.streams import Stream
 
     heard, node = [], Node(ros.reliable())
     stream = Stream(node, type(odometry(0.0)), "odom", heard.append)
@@ -65,8 +65,8 @@ def test_messages_of_one_stamp_are_each_recorded():
 def test_whole_recording_gets_what_was_published_before_it_began(raw):
     from rclpy.qos import DurabilityPolicy
 
-    from bridge import ros
-    from bridge.streams import Stream
+    from bridge.nodes import ros
+    from bridge.nodes.streams import Stream
 
     node = Node(ros.latched())
     stream = Stream(node, type(odometry(0.0)), "map", print, raw)
@@ -79,9 +79,9 @@ def test_whole_recording_gets_what_was_published_before_it_began(raw):
 
 
 def test_commands_that_the_middleware_lost_are_reported():
-    from bridge import ros
+    from bridge.nodes import ros
     from bridge.record import parse_arguments
-    from bridge.record_node import RecordNode
+    from bridge.recording.record_node import RecordNode
 
     node = Node(ros.reliable())
     recorder = RecordNode(node, None, parse_arguments(["logs", "one"]))
@@ -102,7 +102,7 @@ def test_base_hears_commands_unless_it_asks_for_kept_ones_a_deadline_or_signs_of
     from rclpy.duration import Duration
     from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-    from bridge import ros
+    from bridge.nodes import ros
 
     def time(value):
         return Duration(nanoseconds=value)

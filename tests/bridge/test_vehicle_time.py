@@ -2,7 +2,7 @@
 
 import pytest
 
-from bridge.vehicle_time import VehicleTime
+from bridge.driving.vehicle_time import VehicleTime
 
 
 def driven(intervals):

@@ -47,9 +47,9 @@ assert bridge.__file__.startswith(wheel), bridge.__file__
 for module in pkgutil.iter_modules(bridge.__path__):
     importlib.import_module(f"bridge.{module.name}")
 assert "rclpy" not in sys.modules
-from bridge.controller import Controller
+from bridge.driving.controller import Controller
 from bridge.drive import parse_arguments, safety_config
-from bridge.image import RawImage
+from bridge.sensing.image import RawImage
 from bridge.policy import Policy
 loaded = Policy.load(policy)
 controller = Controller(loaded, safety_config(loaded, parse_arguments([policy])))
@@ -81,7 +81,7 @@ def test_wheel_is_pure_python_3_10_with_two_dependencies_and_carries_the_files_o
     for end in ("bridge/fastdds.xml", "whill_bridge/package.xml", "drive.launch.py", "whill.yaml",
                 "whill-bridge.service", "resource_index/packages/whill_bridge"):
         assert any(name.endswith(end) for name in names), end
-    assert "bridge/setup.py" not in names and "bridge/safety.py" in names
+    assert "bridge/setup.py" not in names and "bridge/safeguards/safety.py" in names
 
 
 def test_ament_package_and_wheel_agree_on_name_version_and_licence():
@@ -98,7 +98,7 @@ def test_ament_package_and_wheel_agree_on_name_version_and_licence():
 def test_parameter_file_of_the_package_holds_options_of_the_node_only():
     pytest.importorskip("yaml")
     from bridge.drive import parse_arguments
-    from bridge.parameters import as_options
+    from bridge.nodes.parameters import as_options
 
     file = ROOT / "bridge" / "config" / "whill.yaml"
     options = parse_arguments(as_options(["--ros-args", "--params-file", str(file)], "bridge_drive", "policy"))
@@ -107,7 +107,7 @@ def test_parameter_file_of_the_package_holds_options_of_the_node_only():
 
 @pytest.mark.parametrize("name", ["drive", "twist_mux"])
 def test_launch_file_names_programs_of_the_package_and_topics_of_the_node(name):
-    from bridge import ros
+    from bridge.nodes import ros
 
     text = (ROOT / "bridge" / "launch" / f"{name}.launch.py").read_text(encoding="utf-8")
     compile(text, name, "exec")
@@ -144,8 +144,8 @@ def test_service_stops_the_node_itself_in_order_and_leaves_the_guard_to_stop_a_d
 def test_service_starts_the_node_with_the_parameters_of_the_package():
     pytest.importorskip("yaml")
     from bridge.drive import parse_arguments
-    from bridge.parameters import with_options
-    from bridge.ros import split_ros_arguments
+    from bridge.nodes.parameters import with_options
+    from bridge.nodes.ros import split_ros_arguments
 
     config = configparser.ConfigParser()
     config.read(ROOT / "bridge" / "setup.cfg")

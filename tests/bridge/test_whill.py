@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from fake_chair import FakeChair
 
-from bridge.bases import WHILL
 from bridge.chair import ChairNode, parse_arguments
-from bridge.safety import SafetyConfig, State, Supervisor
-from bridge.whill import (
+from bridge.driving.bases import WHILL
+from bridge.driving.whill import (
     WHEEL_RADIUS,
     ChairGate,
     ChairState,
@@ -19,6 +18,7 @@ from bridge.whill import (
     command_words,
     reported_speed,
 )
+from bridge.safeguards.safety import SafetyConfig, State, Supervisor
 
 pytestmark = pytest.mark.quick
 

@@ -548,9 +548,9 @@ def test_a_converted_dataset_is_itself_convertible(bag, tmp_path):
 
 
 def test_a_bag_joins_a_dataset_that_the_recorder_began(bag, tmp_path):
-    from bridge.dataset_file import write_dataset_file
     from bridge.record import parse_arguments
-    from bridge.trial_writer import TrialWriter
+    from bridge.recording.dataset_file import write_dataset_file
+    from bridge.recording.trial_writer import TrialWriter
 
     folder = tmp_path / "log"
     writer = TrialWriter(folder, "straight_1")

@@ -15,7 +15,7 @@ from conftest import shared_folder
 
 import sysid
 import sysid.inspect as inspect_module
-from bridge.command_table import check_space, make_table, reach_of, read_commands
+from bridge.driving.command_table import check_space, make_table, reach_of, read_commands
 from sysid.errors.space import make_space
 from sysid.inspect import InspectConfig, main
 from sysid.logs import replicates

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sysid
-from bridge.whill import ChairState, WheelOdometry
+from bridge.driving.whill import ChairState, WheelOdometry
 from sysid.logs.bags.messages import chair_odometry, chair_row, joint_row, joint_twist
 from sysid.logs.conversion import ConvertConfig, convert
 from sysid.logs.log import load_log

@@ -9,7 +9,7 @@ import pytest
 
 from bridge.policy import PolicyFileError
 from bridge.simulate import parse_arguments
-from bridge.simulator_choice import make_vehicle
+from bridge.simulation.simulator_choice import make_vehicle
 from whill_mjx.evaluation.options import EvaluateOptions
 from whill_mjx.evaluation.policy_file import load_policy
 from whill_mjx.evaluation.policy_world import find_policy, read_world
@@ -35,7 +35,7 @@ class Simulator:
 
 @pytest.fixture
 def simulate(monkeypatch):
-    monkeypatch.setattr("bridge.chair_simulator.ChairSimulator", Simulator)
+    monkeypatch.setattr("bridge.simulation.chair_simulator.ChairSimulator", Simulator)
     return lambda *words: make_vehicle(parse_arguments([str(word) for word in words])).given
 
 

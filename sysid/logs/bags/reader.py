@@ -1,7 +1,7 @@
 """Reads the streams of a driving log out of a ROS bag (rosbag2 .db3 or .mcap, ROS 1 .bag), without ROS.
 
-Known are the paper's topics, the maker's, and those of `bridge.ros`; others are named by the caller or found by their
-type where only one topic has it. Messages: Twist and TwistStamped as commands, Odometry as odometry, Odometry,
+Known are the paper's topics, the maker's, and those of `bridge.nodes.ros`; others are named by the caller or found by
+their type where only one topic has it. Messages: Twist and TwistStamped as commands, Odometry as odometry, Odometry,
 PoseStamped, PoseWithCovarianceStamped and TransformStamped as outside pose, and the yaw rate of an Imu. Where there is
 no pose, the transforms between frames (TFMessage) are chained to one.
 """

@@ -1,0 +1,1 @@
+"""What every node shares: topics, options, exit codes, the DDS profile."""

@@ -1,0 +1,1 @@
+"""Drives written as trials of a driving-log dataset, and as MCAP files."""

@@ -1,0 +1,1 @@
+"""What stops the vehicle: the state machine, stops from outside, the guard."""

@@ -1,0 +1,1 @@
+"""What a policy reads: images, scans, odometry, and whether frames are fresh."""

@@ -1,0 +1,1 @@
+"""Simulated vehicles behind the topics, and the node that serves them."""

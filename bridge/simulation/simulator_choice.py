@@ -1,0 +1,53 @@
+"""The simulator that the options of `bridge.simulate` name, in the world that they and the policy give."""
+
+import argparse
+import importlib
+from typing import Any
+
+from bridge.nodes.exits import OptionError
+from bridge.simulation.moved_simulator import MovedSimulator
+from bridge.simulation.simulated import SimulatedVehicle
+
+SIMULATOR = "bridge.simulation.chair_simulator:ChairSimulator"
+"""What `--simulator` names unless given."""
+
+
+def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
+    """Return the simulator that `--simulator MODULE:FACTORY` names.
+
+    Raises:
+        ValueError, FileNotFoundError: an option, or the policy's folder, is refused.
+    """
+    module, _, name = options.simulator.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise OptionError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task and "
+                          "vehicle. Correct it or leave it out.") from error
+    changes = dict(options.set)
+    if options.policy is None:
+        given = {"task": options.task or "corridor", "vehicle": options.vehicle, **changes}
+    else:
+        from whill_mjx.evaluation.policy_world import read_world
+
+        world = read_world(options.policy, options.task)
+        given = {"task": world.task, "vehicle": options.vehicle or world.vehicle,
+                 "size": (world.height, world.width), **world.fields, **changes}
+        if world.senses:
+            given["senses"] = world.senses
+    if options.robot is None:
+        if options.wheels:
+            raise OptionError("--wheels names the wheels of a robot file. Give --robot too, or leave it out.")
+        return factory(**given)
+    from sysid.replay.robot_online import OnlineRobot
+    from whill_mjx.env import as_vehicle
+
+    if options.simulator != SIMULATOR:
+        raise OptionError(f"--robot {options.robot} is driven by a simulator of its own. Leave --simulator out.")
+    if given.get("senses"):
+        raise OptionError(f"--robot {options.robot} shows its camera alone, and the policy reads "
+                              f"{', '.join(sorted(given['senses']))}. Leave --robot out.")
+    robot = OnlineRobot(options.robot, options.wheels or ())
+    given["vehicle"] = robot.spec(as_vehicle(given["vehicle"])[0])
+    moved: Any = MovedSimulator(robot, **given)
+    return moved
