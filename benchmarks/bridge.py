@@ -85,7 +85,7 @@ def export_stand_in(folder: Path) -> Path:
     import jax
     import jax.numpy as jnp
 
-    from dreamer.export import PolicyContract, export_policy
+    from dreamer.policy_files.export import PolicyContract, export_policy
 
     keys = jax.random.split(jax.random.key(0), 4)
     weights = {"patch": jax.random.normal(keys[0], (192, 32)) / 14,

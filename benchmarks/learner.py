@@ -23,10 +23,12 @@ import jax.numpy as jnp
 from benchmarks import harness, learner_study
 from benchmarks.learner_updates import ACTION_DIM, OBS_SHAPE, ROWS, STREAMS, random_replay, time_updates
 from bridge.nodes.options import Parser, in_range, whole
-from dreamer import agent as agents
-from dreamer import behavior, distributions, image, optim, replay, rssm, world_model
 from dreamer.config import DreamerConfig, preset
-from dreamer.rssm import Latent
+from dreamer.experience import replay
+from dreamer.layers import distributions, image
+from dreamer.model import agent as agents
+from dreamer.model import behavior, optim, rssm, world_model
+from dreamer.model.rssm import Latent
 from whill_mjx.io.command_line import guarded
 
 Figures = dict[str, dict[str, Any]]

@@ -25,11 +25,12 @@ from jax.experimental.pallas import triton as plt
 
 from benchmarks import harness
 from benchmarks.learner_updates import ACTION_DIM, OBS_SHAPE
-from dreamer import image, rssm
 from dreamer.config import DreamerConfig
-from dreamer.nets import NORM_EPS
-from dreamer.recurrence import Step, Tree
-from dreamer.rssm import Latent
+from dreamer.layers import image
+from dreamer.layers.nets import NORM_EPS
+from dreamer.layers.recurrence import Step, Tree
+from dreamer.model import rssm
+from dreamer.model.rssm import Latent
 from dreamer.types import Params
 
 ALL = slice(None)

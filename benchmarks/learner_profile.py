@@ -22,8 +22,10 @@ import jax
 
 from benchmarks import harness
 from benchmarks.learner_updates import Updates
-from dreamer import behavior, optim, replay, rssm, sensors, world_model
 from dreamer.config import DreamerConfig
+from dreamer.experience import replay
+from dreamer.layers import sensors
+from dreamer.model import behavior, optim, rssm, world_model
 
 PLACES: tuple[tuple[str, Any, str], ...] = (
     ("encoder", sensors, "encode"),

@@ -39,9 +39,10 @@ import jax.numpy as jnp
 from benchmarks import harness, learner_fused, learner_profile
 from benchmarks.learner_updates import Updates
 from bridge.nodes.options import in_range, whole
-from dreamer import distributions, recurrence, rssm
 from dreamer.config import DreamerConfig
-from dreamer.rssm import Latent
+from dreamer.layers import distributions, recurrence
+from dreamer.model import rssm
+from dreamer.model.rssm import Latent
 from dreamer.types import Params
 
 Figures = dict[str, dict[str, Any]]

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer import agent as agents
-from dreamer import replay, seeds
 from dreamer.config import DreamerConfig
-from dreamer.host_replay import HostFrames
-from dreamer.programs import compile_lowered
-from dreamer.replay import Replay
+from dreamer.experience import replay
+from dreamer.experience.host_replay import HostFrames
+from dreamer.experience.replay import Replay
+from dreamer.model import agent as agents
+from dreamer.training import seeds
+from dreamer.training.programs import compile_lowered
 
 OBS_SHAPE = (64, 64, 3)
 ACTION_DIM = 2
@@ -71,7 +72,7 @@ class Updates:
     """`per_block` updates as one program: traced on making, compiled by `compile`, timed by `run`."""
 
     def __init__(self, config: DreamerConfig, per_block: int, runs: int = 0) -> None:
-        """`runs` agents side by side, as `dreamer.seeds` has them; 0 is one agent without a seed axis."""
+        """`runs` agents side by side, as `dreamer.training.seeds` has them; 0 is one agent without a seed axis."""
         self._per_block = per_block
         self._keys = jax.random.split(jax.random.PRNGKey(0), runs) if runs else jax.random.PRNGKey(0)
 

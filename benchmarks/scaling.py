@@ -25,11 +25,11 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from benchmarks.harness import RESULTS, figure, record
-from dreamer import agent as agents
-from dreamer import parallel
 from dreamer.config import DreamerConfig, preset
-from dreamer.iteration import Metrics, TrainState, compile_iteration, init_state, replayed_updates
-from dreamer.replay import Replay
+from dreamer.experience.iteration import Metrics, TrainState, compile_iteration, init_state, replayed_updates
+from dreamer.experience.replay import Replay
+from dreamer.model import agent as agents
+from dreamer.training import parallel
 from dreamer.types import FunctionalEnv, Transition
 from whill_mjx.devices import choose_devices
 from whill_mjx.io.command_line import COUNT, run

@@ -9,17 +9,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dreamer.checkpoint import CheckpointError as CheckpointError
     from dreamer.config import DreamerConfig as DreamerConfig
     from dreamer.config import preset as preset
-    from dreamer.export import PolicyContract as PolicyContract
-    from dreamer.export import export_policy as export_policy
     from dreamer.gym import from_gym as from_gym
     from dreamer.policy import Policy as Policy
+    from dreamer.policy_files.export import PolicyContract as PolicyContract
+    from dreamer.policy_files.export import export_policy as export_policy
     from dreamer.spaces import Box as Box
     from dreamer.spaces import Discrete as Discrete
     from dreamer.train import TrainingOptions as TrainingOptions
     from dreamer.train import TrainResult as TrainResult
+    from dreamer.training.checkpoint import CheckpointError as CheckpointError
     from dreamer.types import FunctionalEnv as FunctionalEnv
     from dreamer.types import Mirror as Mirror
     from dreamer.types import Transition as Transition
@@ -36,9 +36,9 @@ _HOMES = {
     "TrainingOptions": "dreamer.train",
     "TrainResult": "dreamer.train",
     "Policy": "dreamer.policy",
-    "PolicyContract": "dreamer.export",
-    "export_policy": "dreamer.export",
-    "CheckpointError": "dreamer.checkpoint",
+    "PolicyContract": "dreamer.policy_files.export",
+    "export_policy": "dreamer.policy_files.export",
+    "CheckpointError": "dreamer.training.checkpoint",
 }
 __all__ = list(_HOMES)
 

@@ -81,8 +81,8 @@ class DreamerConfig:
     max_std: float = 1.0
     """Largest standard deviation of the policy."""
     noise_steps: float = 0.0
-    """Longest time constant [steps] of the noise with which training acts, at least 1 (`dreamer.exploration`); 0: the
-    noise of every step is independent. Continuous actions only."""
+    """Longest time constant [steps] of the noise with which training acts, at least 1
+    (`dreamer.experience.exploration`); 0: the noise of every step is independent. Continuous actions only."""
     greedy_share: float = 0.0
     """Share of the instances that act in training as evaluations do, by the most probable action, rounded up: the model
     then sees where that leads. Without, it may believe in a place where only the best actions would stay."""

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer import agent as agents
-from dreamer import seeds, spaces
+from dreamer import spaces
 from dreamer.config import DreamerConfig
-from dreamer.programs import Kept, Programs
+from dreamer.model import agent as agents
+from dreamer.training import seeds
+from dreamer.training.programs import Kept, Programs
 from dreamer.types import FunctionalEnv, Params
 
 

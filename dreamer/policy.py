@@ -4,8 +4,8 @@
     action, carry = policy.step(obs, carry)      # carry None begins an episode
 
 A folder, or a zip of it, holds `policy.json` (sizes, observations, actions) and `weights.npz` (plain arrays); nothing
-in it can execute code. What `dreamer.export` wrote, agents and the policy files of vehicles (docs/policy_file.md), is
-read as well and runs in onnxruntime. All kinds are read and checked by `bridge.policy`.
+in it can execute code. What `dreamer.policy_files.export` wrote, agents and the policy files of vehicles
+(docs/policy_file.md), is read as well and runs in onnxruntime. All kinds are read and checked by `bridge.policy`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,11 @@ from bridge.policy import (
     read_arrays,
     read_policy,
 )
-from dreamer import agent, export, sensors, spaces
+from dreamer import spaces
 from dreamer.config import DreamerConfig
+from dreamer.layers import sensors
+from dreamer.model import agent
+from dreamer.policy_files import export
 from dreamer.spaces import ActionSpec, Box, Discrete, ObsShape
 from dreamer.types import Params
 

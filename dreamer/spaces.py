@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from dreamer import distributions as dist
 from dreamer.config import DreamerConfig
+from dreamer.layers import distributions as dist
 
 Shape = tuple[int, ...]
 ObsShape = Shape | Mapping[str, Shape]

@@ -16,12 +16,10 @@ import jax.numpy as jnp
 from filelock import FileLock, Timeout
 from jax.sharding import Mesh
 
-from dreamer import checkpoint, parallel, pretrain, seeds
-from dreamer.agent import AgentState
 from dreamer.config import DreamerConfig
 from dreamer.evaluate import evaluate
-from dreamer.first_state import check_seed, first_state, fits, save_state
-from dreamer.iteration import (
+from dreamer.experience import pretrain
+from dreamer.experience.iteration import (
     TrainState,
     compile_init,
     compile_iteration,
@@ -29,9 +27,12 @@ from dreamer.iteration import (
     lower_iteration,
     train_iteration,
 )
-from dreamer.metrics_log import Log, Meter, MetricsFn, evaluated, headline
-from dreamer.programs import Place, Programs, compiled, in_thread
-from dreamer.progress import Progress
+from dreamer.model.agent import AgentState
+from dreamer.training import checkpoint, parallel, seeds
+from dreamer.training.first_state import check_seed, first_state, fits, save_state
+from dreamer.training.metrics_log import Log, Meter, MetricsFn, evaluated, headline
+from dreamer.training.programs import Place, Programs, compiled, in_thread
+from dreamer.training.progress import Progress
 from dreamer.types import FunctionalEnv, Params
 
 __all__ = ["TrainingOptions", "TrainResult", "TrainState", "evaluate", "init_state", "train", "train_iteration"]

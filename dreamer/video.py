@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer import agent, image, rssm, sensors, spaces
-from dreamer import distributions as dist
+from dreamer import spaces
 from dreamer.config import DreamerConfig
-from dreamer.rssm import Latent
+from dreamer.layers import distributions as dist
+from dreamer.layers import image, sensors
+from dreamer.model import agent, rssm
+from dreamer.model.rssm import Latent
 from dreamer.types import FunctionalEnv, Params
 
 

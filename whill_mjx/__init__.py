@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from whill_mjx.env import make_env as make_env
     from whill_mjx.env import reset as reset
     from whill_mjx.env import step as step
-    from whill_mjx.evaluation.policy_file import load_policy as load_policy
+    from whill_mjx.evaluation.policies.policy_file import load_policy as load_policy
     from whill_mjx.gym import WhillEnv as WhillEnv
     from whill_mjx.gym.vector import WhillVectorEnv as WhillVectorEnv
     from whill_mjx.processor import device_per_core as device_per_core
@@ -60,7 +60,7 @@ _HOMES = {
     "EFFECTS": "whill_mjx.effects",
     "make_effect": "whill_mjx.effects",
     "register": "whill_mjx.effects",
-    "load_policy": "whill_mjx.evaluation.policy_file",
+    "load_policy": "whill_mjx.evaluation.policies.policy_file",
     "share_results": "whill_mjx.processor",
 }
 _EXTENDING = {

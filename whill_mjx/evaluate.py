@@ -24,7 +24,7 @@ import jax
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_keys, headline, summarise
 from whill_mjx.evaluation.options import EvaluateOptions
-from whill_mjx.evaluation.output_files import OUTPUTS, remove_earlier, write_pictures
+from whill_mjx.evaluation.output.output_files import OUTPUTS, remove_earlier, write_pictures
 from whill_mjx.evaluation.preparation import Plan, make_plan
 from whill_mjx.evaluation.sweeps import Sweep, run_sweep
 from whill_mjx.io.folders import claim_folder
@@ -86,7 +86,7 @@ def evaluate(plan: Plan, began: float, stage: Callable[[str], None] = say) -> di
     evaluation["seconds"] = time.perf_counter() - began
     write_json(options.out / "evaluation.json", evaluation, allow_nan=False)
     if options.html:
-        from whill_mjx.evaluation.pages import page
+        from whill_mjx.evaluation.output.pages import page
 
         say(f"open {page(evaluation, pictures, videos, options.out / 'report.html')} in a browser")
     files = ", ".join(["evaluation.json", *(one.name for one in (*pictures, *videos))])

@@ -22,8 +22,8 @@ if starts(__name__):
     say_loading()
 
 from whill_mjx.env import Env, make_env
-from whill_mjx.evaluation.planner_pictures import contact_sheet, planner_film, record_planner
-from whill_mjx.evaluation.rerun_log import load_rerun
+from whill_mjx.evaluation.output.planner_pictures import contact_sheet, planner_film, record_planner
+from whill_mjx.evaluation.output.rerun_log import load_rerun
 from whill_mjx.io.folders import check_file, note_written
 from whill_mjx.io.png import write_png
 from whill_mjx.io.video import VIDEOS, write_video

@@ -28,7 +28,7 @@ if starts(__name__):
 
     wake_gpu()
 
-from dreamer import checkpoint, parallel
+from dreamer.training import checkpoint, parallel
 from whill_mjx.devices import join
 from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import claim_folder

@@ -43,7 +43,8 @@ MAX_NUMBER = 1e15
 """Largest number in `policy.json`. All of them are sizes, rates, speeds and angles."""
 CHUNK = MIB
 """Bytes that are hashed at a time."""
-EXPORT_AGAIN = "Export the policy again (dreamer.export.export_policy; an agent: export_agent or dreamer.policy.save)"
+EXPORT_AGAIN = ("Export the policy again (dreamer.policy_files.export.export_policy; an agent: export_agent or "
+                "dreamer.policy.save)")
 COPY_AGAIN = "Copy the policy file again, or export the policy again"
 
 

@@ -28,7 +28,7 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     if options.policy is None:
         given = {"task": options.task or "corridor", "vehicle": options.vehicle, **changes}
     else:
-        from whill_mjx.evaluation.policy_world import read_world
+        from whill_mjx.evaluation.policies.policy_world import read_world
 
         world = read_world(options.policy, options.task)
         given = {"task": world.task, "vehicle": options.vehicle or world.vehicle,

@@ -13,8 +13,8 @@ import pytest
 
 from benchmarks import learner, learner_fused, learner_profile, learner_study
 from benchmarks.learner_profile import Event
-from dreamer import rssm
 from dreamer.config import preset
+from dreamer.model import rssm
 
 CONFIG = preset("cpu", deter=16, hidden=8, stoch=3, classes=4, blocks=4)
 PROGRAM = """HloModule jit_block

@@ -9,8 +9,8 @@ import tiny_policy
 
 from bridge.policy import read_policy
 from whill_mjx.env import make_env
-from whill_mjx.evaluation import policy_file
-from whill_mjx.evaluation.policy_world import read_world
+from whill_mjx.evaluation.policies import policy_file
+from whill_mjx.evaluation.policies.policy_world import read_world
 from whill_mjx.sensors.camera import Camera
 from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.lidar import Lidar

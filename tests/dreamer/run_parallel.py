@@ -15,10 +15,12 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
 from dreamer_toys import corridor_env, tiny_config  # noqa: E402
 
-from dreamer import iteration, parallel, sensors  # noqa: E402
-from dreamer.first_state import first_state  # noqa: E402
-from dreamer.programs import Place  # noqa: E402
+from dreamer.experience import iteration  # noqa: E402
+from dreamer.layers import sensors  # noqa: E402
 from dreamer.train import TrainingOptions, train  # noqa: E402
+from dreamer.training import parallel  # noqa: E402
+from dreamer.training.first_state import first_state  # noqa: E402
+from dreamer.training.programs import Place  # noqa: E402
 
 # Learning starts with the last iteration: two updates. Later ones amplify rounding, since the outer bins of a young
 # two-hot critic are near 5e8, so that runs agree in what they learn but not in every digit.

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from dreamer_toys import SHAPE, tiny_config
 
-from dreamer import agent, behavior, rssm, world_model
-from dreamer import distributions as dist
-from dreamer.behavior import ReturnNorm
+from dreamer.layers import distributions as dist
+from dreamer.model import agent, behavior, rssm, world_model
+from dreamer.model.behavior import ReturnNorm
 
 CONFIG = tiny_config(imag_horizon=15)
 M = 4

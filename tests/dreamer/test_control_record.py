@@ -5,7 +5,7 @@ import argparse
 import pytest
 
 from benchmarks import cartpole
-from dreamer.iteration import credit_rates
+from dreamer.experience.iteration import credit_rates
 
 OPTIONS = argparse.Namespace(task="grid", sight="image", preset="tiny", episodes=4, instances=2, steps=40, ratio=None,
                              unroll=None)  # fmt: skip

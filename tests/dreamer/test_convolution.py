@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from dreamer_toys import tiny_config
 
-from dreamer import agent, convolution, image, nets
+from dreamer.layers import convolution, image, nets
+from dreamer.model import agent
 
 
 def random(*shape, seed=0):

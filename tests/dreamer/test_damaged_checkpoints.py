@@ -14,8 +14,8 @@ from dreamer_toys import tiny_config
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dreamer import checkpoint
-from dreamer.metrics_log import Log
+from dreamer.training import checkpoint
+from dreamer.training.metrics_log import Log
 
 
 @dataclass(frozen=True)

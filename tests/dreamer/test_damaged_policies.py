@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.policy import PolicyFileError
-from dreamer import agent, spaces
+from dreamer import spaces
+from dreamer.model import agent
 from dreamer.policy import Policy, save
 
 CONFIG = tiny_config()

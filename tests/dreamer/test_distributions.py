@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dreamer import distributions as dist
+from dreamer.layers import distributions as dist
 
 
 @pytest.mark.quick

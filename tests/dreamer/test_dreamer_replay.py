@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from dreamer_toys import echo_env, tiny_config
 
-from dreamer import iteration, optim, replay, world_model
-from dreamer.rssm import Latent
+from dreamer.experience import iteration, replay
+from dreamer.model import optim, world_model
+from dreamer.model.rssm import Latent
 from dreamer.types import Mirror, Transition
 
 N, T = 3, 4

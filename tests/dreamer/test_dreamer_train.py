@@ -14,8 +14,9 @@ import pytest
 from dreamer_toys import corridor_env, counting_env, tiny_config, train_without_end
 from filelock import FileLock
 
-from dreamer import checkpoint, iteration
+from dreamer.experience import iteration
 from dreamer.train import TrainingOptions, copied, evaluate, train
+from dreamer.training import checkpoint
 
 ENV = corridor_env(4)
 CONFIG = tiny_config(lr=1e-3, train_ratio=64.0)

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from dreamer_toys import choice_env, corridor_env, tiny_config
 
-from dreamer import exploration, iteration, spaces, world_model
-from dreamer.rssm import Latent
+from dreamer import spaces
+from dreamer.experience import exploration, iteration
+from dreamer.model import world_model
+from dreamer.model.rssm import Latent
 
 INSTANCES, WIDTH, STEPS = 8, 512, 60
 CONFIG = tiny_config(noise_steps=20.0)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from dreamer.export import PolicyContract, export_policy, flatten_weights
-from dreamer.network import Network, parity, to_onnx
+from dreamer.policy_files.export import PolicyContract, export_policy, flatten_weights
+from dreamer.policy_files.network import Network, parity, to_onnx
 
 CONTRACT = PolicyContract(action_low=(0.0, -0.6), action_high=(0.3, 0.6), task="corridor", height=16, width=16)
 DETER, GROUPS, STOCH, CLASSES, HIDDEN, PATCH = 32, 4, 4, 4, 16, 8
@@ -170,7 +170,7 @@ def test_step_that_breaks_the_contract_is_refused_and_nothing_is_written(tmp_pat
 
 
 def test_step_that_onnx_computes_differently_is_refused(tmp_path, monkeypatch):
-    import dreamer.export
+    import dreamer.policy_files.export
 
     def step(carry, image):
         return carry, jnp.tanh(image[0, 0, :2] / 255.0)
@@ -179,8 +179,8 @@ def test_step_that_onnx_computes_differently_is_refused(tmp_path, monkeypatch):
         wrong = lambda carry, obs: (carry, (jnp.tanh(obs["image"][0, 0, 1:] / 255.0),))  # noqa: E731
         return original(dataclasses.replace(network, step=wrong))
 
-    original = dreamer.export.to_onnx
-    monkeypatch.setattr(dreamer.export, "to_onnx", wrong_model)
+    original = dreamer.policy_files.export.to_onnx
+    monkeypatch.setattr(dreamer.policy_files.export, "to_onnx", wrong_model)
     with pytest.raises(ValueError, match="it differs from JAX"):
         export_policy(tmp_path / "p", step, {"h": np.zeros(2, np.float32)}, {}, CONTRACT, check_steps=5)
     assert not list(tmp_path.iterdir())
@@ -215,8 +215,8 @@ def test_contract_without_meaning_is_refused(change):
 @pytest.mark.parametrize("encoder", ["conv", "patch"])
 def test_policy_of_the_learner_runs_on_the_vehicle_as_it_does_in_jax(tmp_path, encoder):
     from bridge.policy import Policy
-    from dreamer import agent
     from dreamer.config import DreamerConfig
+    from dreamer.model import agent
 
     config = DreamerConfig(encoder=encoder, deter=32, hidden=16, units=16, stoch=4, classes=4, blocks=4, depth=4,
                            mults=(1, 2), patch_units=4, policy_outscale=1.0, learning_starts=0)

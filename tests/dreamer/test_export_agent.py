@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from dreamer_toys import tiny_config
 
-import dreamer.export
+import dreamer.policy_files.export
 from bridge.policy import Policy as Driver
 from bridge.policy import PolicyFileError
-from dreamer import agent, sensors
-from dreamer.export import PolicyContract, SensingPolicy, export_agent, export_sensing
-from dreamer.network import Network
+from dreamer.layers import sensors
+from dreamer.model import agent
 from dreamer.policy import Policy, of_agent
+from dreamer.policy_files.export import PolicyContract, SensingPolicy, export_agent, export_sensing
+from dreamer.policy_files.network import Network
 from dreamer.spaces import Box, Discrete
 
 CONFIG = tiny_config(policy_outscale=3.0, compute_dtype="bfloat16")
@@ -103,8 +104,8 @@ def test_a_network_that_prefers_its_classes_otherwise_is_refused(tmp_path, monke
 
         return original(dataclasses.replace(network, step=step))
 
-    original = dreamer.export.to_onnx
-    monkeypatch.setattr(dreamer.export, "to_onnx", warped)
+    original = dreamer.policy_files.export.to_onnx
+    monkeypatch.setattr(dreamer.policy_files.export, "to_onnx", warped)
     with pytest.raises(ValueError, match="it differs from JAX"):
         export_agent(tmp_path / "p", config, params, shape, action)
     assert not list(Path(tmp_path).iterdir())
@@ -113,7 +114,7 @@ def test_a_network_that_prefers_its_classes_otherwise_is_refused(tmp_path, monke
 @pytest.mark.quick
 def test_parameters_of_other_actions_or_several_seeds_are_refused(tmp_path):
     params = {"policy": {"out": {"b": np.zeros((2, 4))}}}
-    with pytest.raises(ValueError, match=r"shape \(2, 4\).*dreamer.seeds.pick"):
+    with pytest.raises(ValueError, match=r"shape \(2, 4\).*dreamer.training.seeds.pick"):
         export_agent(tmp_path / "p", CONFIG, params, (5,), 2)
     with pytest.raises(ValueError, match=r"Discrete\(classes=4\) needs \(4,\)"):
         export_agent(tmp_path / "p", CONFIG, {"policy": {"out": {"b": np.zeros(3)}}}, (5,), Discrete(4))

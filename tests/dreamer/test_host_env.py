@@ -8,11 +8,13 @@ import pytest
 from dreamer_toys import tiny_config
 from gymnasium import spaces as gs
 
-from dreamer import agent, iteration, spaces
+from dreamer import spaces
 from dreamer.evaluate import Rounds, evaluate
-from dreamer.export import PolicyContract, export_policy
+from dreamer.experience import iteration
 from dreamer.gym import from_gym, read_actions, read_observations
+from dreamer.model import agent
 from dreamer.policy import Policy, of_agent, save
+from dreamer.policy_files.export import PolicyContract, export_policy
 from dreamer.spaces import Box, Discrete
 from dreamer.train import TrainingOptions, train
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from dreamer_toys import corridor_env, tiny_config
 
-from dreamer import host_replay, replay
-from dreamer.rssm import Latent
+from dreamer.experience import host_replay, replay
+from dreamer.model.rssm import Latent
 from dreamer.train import TrainingOptions, train
 from dreamer.types import Transition
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from dreamer_toys import tiny_config
 
-from dreamer import iteration, replay
-from dreamer.replay import Window
-from dreamer.rssm import Latent
+from dreamer.experience import iteration, replay
+from dreamer.experience.replay import Window
+from dreamer.model.rssm import Latent
 
 T = 4
 CONFIG = tiny_config(batch_size=4, batch_length=T, replay_capacity=24)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from dreamer_toys import SHAPE, tiny_config
 
-from dreamer import agent, behavior, world_model
-from dreamer import distributions as dist
-from dreamer.behavior import Outcome, ReturnNorm
-from dreamer.rssm import Latent
+from dreamer.layers import distributions as dist
+from dreamer.model import agent, behavior, world_model
+from dreamer.model.behavior import Outcome, ReturnNorm
+from dreamer.model.rssm import Latent
 
 CONFIG = tiny_config(imag_horizon=15)
 M, T, B, A = 5, 6, 3, 2

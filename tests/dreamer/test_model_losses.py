@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from dreamer_toys import SHAPE, tiny_config
 
-from dreamer import agent, rssm, world_model
-from dreamer.replay import Batch
+from dreamer.experience.replay import Batch
+from dreamer.model import agent, rssm, world_model
 
 CONFIG = tiny_config()
 T, B = 5, 2

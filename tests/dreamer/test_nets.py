@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from dreamer_toys import SHAPE, tiny_config
 
-from dreamer import agent, image, nets, optim
 from dreamer.config import DreamerConfig, preset
+from dreamer.layers import image, nets
+from dreamer.model import agent, optim
 
 
 def random(*shape, seed=0):

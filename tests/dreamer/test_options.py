@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from dreamer_toys import SHAPE, corridor_env, tiny_config
 
-from dreamer import agent, checkpoint, sensors
 from dreamer.config import DreamerConfig
-from dreamer.iteration import compile_init, train_iteration
-from dreamer.progress import Progress
-from dreamer.rssm import Latent
+from dreamer.experience.iteration import compile_init, train_iteration
+from dreamer.layers import sensors
+from dreamer.model import agent
+from dreamer.model.rssm import Latent
 from dreamer.train import TrainingOptions, train
+from dreamer.training import checkpoint
+from dreamer.training.progress import Progress
 
 KEY = jax.random.PRNGKey(0)
 CONFIG = tiny_config()

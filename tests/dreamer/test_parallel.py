@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dreamer import parallel
+from dreamer.training import parallel
 
 SCRIPT = Path(__file__).parent / "run_parallel.py"
 

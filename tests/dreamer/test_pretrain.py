@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from dreamer_toys import choice_env, tiny_config
 
-from dreamer import checkpoint, iteration, pretrain, seeds
+from dreamer.experience import iteration, pretrain
 from dreamer.train import TrainingOptions, train
+from dreamer.training import checkpoint, seeds
 from dreamer.types import Mirror
 
 

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from dreamer_toys import corridor_env, tiny_config
 
-from dreamer import programs, train
-from dreamer.programs import Programs, compile_lowered, compiled
+from dreamer import train
+from dreamer.training import programs
+from dreamer.training.programs import Programs, compile_lowered, compiled
 
 HERE = Path(__file__).parent
 ENV = corridor_env(4)
@@ -87,8 +88,9 @@ sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from unittest import mock
 from test_programs import CONFIG, ENV, QUIET
-from dreamer import iteration, train
-from dreamer.programs import Programs
+from dreamer.experience import iteration
+from dreamer import train
+from dreamer.training.programs import Programs
 seen, collect = [], iteration.collect
 def counted(*args):
     seen.append(1)

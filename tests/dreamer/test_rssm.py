@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from dreamer_toys import SHAPE, tiny_config
 
-from dreamer import agent, image, rssm, world_model
-from dreamer import distributions as dist
-from dreamer.rssm import Latent
+from dreamer.layers import distributions as dist
+from dreamer.layers import image
+from dreamer.model import agent, rssm, world_model
+from dreamer.model.rssm import Latent
 
 CONFIG = tiny_config()
 T, B, A = 8, 2, 2

@@ -9,8 +9,8 @@ import pytest
 from dreamer_toys import tiny_config
 
 from benchmarks import grid_env
-from dreamer import seeds
 from dreamer.train import TrainingOptions, evaluate, train
+from dreamer.training import seeds
 
 ENV = grid_env.make(4)
 # Learning starts with the last of nine iterations: rounding, which grows with every update, has no time to.

@@ -11,12 +11,16 @@ import pytest
 from dreamer_toys import SHAPE, choice_env, corridor_env, tiny_config
 from PIL import Image
 
-from dreamer import agent, behavior, checkpoint, iteration, nets, rssm, sensors, spaces, video
-from dreamer import distributions as dist
+from dreamer import spaces, video
 from dreamer.config import preset
-from dreamer.rssm import Latent
+from dreamer.experience import iteration
+from dreamer.layers import distributions as dist
+from dreamer.layers import nets, sensors
+from dreamer.model import agent, behavior, rssm
+from dreamer.model.rssm import Latent
 from dreamer.spaces import Box, Discrete
 from dreamer.train import TrainingOptions, evaluate, train
+from dreamer.training import checkpoint
 
 CONFIG = tiny_config()
 KEY = jax.random.PRNGKey(0)

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from dreamer.export import flatten_weights, save_arrays
+from dreamer.policy_files.export import flatten_weights, save_arrays
 from dreamer.train import TrainingOptions
 from whill_mjx.io.folders import claim_folder, whole_file
 from whill_mjx.learning.ppo import PpoConfig

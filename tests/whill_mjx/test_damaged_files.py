@@ -13,7 +13,7 @@ from damage import Costs
 from damaged_bytes import check
 
 from whill_mjx import maps
-from whill_mjx.evaluation.policy_world import trained_fields
+from whill_mjx.evaluation.policies.policy_world import trained_fields
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.folders import FolderRefused, claim_folder
 from whill_mjx.io.reading import read_lines

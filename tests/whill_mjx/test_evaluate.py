@@ -17,16 +17,16 @@ import pytest
 from whill_mjx.effects import EFFECTS
 from whill_mjx.env import make_env, reset_state
 from whill_mjx.evaluate import main
-from whill_mjx.evaluation import pages
 from whill_mjx.evaluation.conditions import nominal, seen_under
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.episodes import Course, Episodes, episode_figures, headline, summarise
 from whill_mjx.evaluation.intervals import bootstrap_interval, wilson_interval
-from whill_mjx.evaluation.onnx_network import Network
 from whill_mjx.evaluation.options import EvaluateOptions
-from whill_mjx.evaluation.output_files import write_pictures
-from whill_mjx.evaluation.pages import episode_video
-from whill_mjx.evaluation.policy_file import load_policy
+from whill_mjx.evaluation.output import pages
+from whill_mjx.evaluation.output.output_files import write_pictures
+from whill_mjx.evaluation.output.pages import episode_video
+from whill_mjx.evaluation.policies.onnx_network import Network
+from whill_mjx.evaluation.policies.policy_file import load_policy
 from whill_mjx.evaluation.preparation import choose_task
 from whill_mjx.evaluation.rollouts import CHANNELS, View, rollout
 from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, with_parameter

@@ -12,7 +12,7 @@ from PIL import Image
 
 from whill_mjx.env import make_env, reset_state
 from whill_mjx.env.view_from_above import top_view
-from whill_mjx.evaluation import planner_pictures
+from whill_mjx.evaluation.output import planner_pictures
 from whill_mjx.io.png import write_png
 from whill_mjx.look import Look, main
 from whill_mjx.tasks.check import why_no_world

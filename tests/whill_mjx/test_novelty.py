@@ -7,10 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dreamer import agent as agents
+from dreamer.model import agent as agents
 from dreamer.spaces import vector_size
 from whill_mjx.env import make_env
-from whill_mjx.evaluation.novelty import BELIEVED, RATE, SURPRISE, contradiction, largest_surprise, limits, watched
+from whill_mjx.evaluation.policies.novelty import (
+    BELIEVED,
+    RATE,
+    SURPRISE,
+    contradiction,
+    largest_surprise,
+    limits,
+    watched,
+)
 from whill_mjx.learning.setup import TRUTH, dreamer_policy, find_preset, obs_shape_of, with_truth
 
 pytestmark = pytest.mark.quick
@@ -93,9 +101,9 @@ def test_drives_that_do_not_arrive_do_not_raise_the_limits():
 
 def test_the_exported_network_of_a_watched_policy_is_one_that_evaluations_compile():
     """Its file is what `whill_mjx.evaluate` reads."""
-    from dreamer.network import Network as Exported
-    from dreamer.network import parity, to_onnx
-    from whill_mjx.evaluation.onnx_network import Network
+    from dreamer.policy_files.network import Network as Exported
+    from dreamer.policy_files.network import parity, to_onnx
+    from whill_mjx.evaluation.policies.onnx_network import Network
 
     def step(weights, carry, image):
         mean = jnp.mean(image.astype(jnp.float32)) / 255.0

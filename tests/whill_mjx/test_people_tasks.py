@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, observe, reset_state, sense, step_state
-from whill_mjx.evaluation.rerun_log import RerunLog, _capsules, load_rerun
+from whill_mjx.evaluation.output.rerun_log import RerunLog, _capsules, load_rerun
 from whill_mjx.gym import WhillEnv
 from whill_mjx.gym.kinds import info_names
 from whill_mjx.io.command_line import OptionError

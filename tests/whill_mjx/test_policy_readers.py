@@ -16,7 +16,7 @@ import pytest
 import bridge.policy
 import dreamer.policy
 from bridge.policy import PolicyFileError
-from whill_mjx.evaluation.policy_file import camera_contract, load_policy
+from whill_mjx.evaluation.policies.policy_file import camera_contract, load_policy
 from whill_mjx.vehicle.dynamics import drive, place
 from whill_mjx.vehicle.kinematics import camera_pose
 from whill_mjx.vehicle.model import build_model
@@ -103,7 +103,7 @@ def test_a_vehicle_file_that_is_not_listed_is_not_used(folder):
 
 @pytest.mark.quick
 def test_an_operator_that_cannot_be_compiled_is_refused_with_the_other_runtime_as_the_remedy(folder, monkeypatch):
-    monkeypatch.setattr("whill_mjx.evaluation.onnx_network.OPERATORS", {})
+    monkeypatch.setattr("whill_mjx.evaluation.policies.onnx_network.OPERATORS", {})
     with pytest.raises(PolicyFileError, match="policy.onnx: operator .* is not known.*runtime 'onnxruntime'"):
         load_policy(folder)
     load_policy(folder, "onnxruntime")

@@ -11,8 +11,8 @@ from bridge.policy import PolicyFileError
 from bridge.simulate import parse_arguments
 from bridge.simulation.simulator_choice import make_vehicle
 from whill_mjx.evaluation.options import EvaluateOptions
-from whill_mjx.evaluation.policy_file import load_policy
-from whill_mjx.evaluation.policy_world import find_policy, read_world
+from whill_mjx.evaluation.policies.policy_file import load_policy
+from whill_mjx.evaluation.policies.policy_world import find_policy, read_world
 from whill_mjx.evaluation.preparation import choose_task
 
 

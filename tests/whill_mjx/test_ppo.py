@@ -101,8 +101,8 @@ def test_the_exported_step_sees_what_the_network_was_trained_on():
 
 
 def test_the_exported_network_acts_like_the_trained_one(tmp_path):
-    from dreamer.export import PolicyContract, export_policy
-    from whill_mjx.evaluation.policy_file import load_policy
+    from dreamer.policy_files.export import PolicyContract, export_policy
+    from whill_mjx.evaluation.policies.policy_file import load_policy
 
     params = Network(TINY, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 6), jnp.uint8))
     params["params"]["Dense_1"]["kernel"] *= 1e4  # a new network's actions are all near zero
@@ -189,7 +189,7 @@ def test_an_interrupted_baseline_goes_on_to_the_bits_of_an_uninterrupted_one(tmp
 
 
 def test_another_setting_of_the_baseline_is_refused_on_resuming(tmp_path):
-    from dreamer.checkpoint import CheckpointError
+    from dreamer.training.checkpoint import CheckpointError
 
     env, each = half_lit_env(4), 4 * TINY.rollout
     train_ppo(env, TINY, tmp_path, Length(each), 0, QUIET)
@@ -244,7 +244,7 @@ def test_the_exported_step_remembers_what_the_network_was_trained_on(config):
 def test_the_exported_network_of_several_readings_drives_through_the_bridge_like_the_trained_one(tmp_path):
     """Two episodes: the second begins with its own first readings, whatever the first one ended with."""
     from bridge.policy import Policy
-    from dreamer.export import PolicyContract, SensingPolicy, export_sensing
+    from dreamer.policy_files.export import PolicyContract, SensingPolicy, export_sensing
 
     empty = empty_frames(SENSING, SHAPES, (1,))
     params = Network(SENSING, 2).init(jax.random.key(0), empty)

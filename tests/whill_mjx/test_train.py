@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dreamer.iteration import credit_rates
+from dreamer.experience.iteration import credit_rates
 from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices, join, launched_processes
 from whill_mjx.env import make_env
 from whill_mjx.evaluation.intervals import wilson_interval
 from whill_mjx.evaluation.options import EvaluateOptions
-from whill_mjx.evaluation.policy_file import load_policy
+from whill_mjx.evaluation.policies.policy_file import load_policy
 from whill_mjx.evaluation.preparation import choose_task
 from whill_mjx.io import command_line
 from whill_mjx.io.command_line import OptionError
@@ -99,7 +99,7 @@ def test_the_exported_policy_runs_on_the_bridge_and_gives_commands_within_the_li
 
 def test_the_exported_policy_keeps_to_the_limits_of_its_training_by_itself(run):
     """Commands of the file change by at most 0.5 m/s and 1 rad/s from one decision (0.5 s) to the next, from rest."""
-    from whill_mjx.evaluation.policy_file import load_policy
+    from whill_mjx.evaluation.policies.policy_file import load_policy
 
     policy = load_policy(run[0].out / "policy")
     assert "command" in policy.carry
@@ -191,7 +191,7 @@ def test_the_best_parameters_are_those_of_most_successes_then_of_most_return(tmp
     for steps in (1, 2, 3, 4):
         evaluate({"w": jnp.full(2, float(steps))}, steps)
     assert read_best(tmp_path)["env_steps"] == 3
-    from dreamer import checkpoint
+    from dreamer.training import checkpoint
 
     state, _ = checkpoint.load(tmp_path / "best" / f"{3:012d}", {"params": {"w": jnp.zeros(2)}}, preset.learner)
     np.testing.assert_array_equal(state["params"]["w"], 3.0)
@@ -373,7 +373,7 @@ def test_unknown_presets_and_tasks_are_named(name, task, message):
 @pytest.mark.quick
 @pytest.mark.parametrize("task", ["corridor", "obstacle_course"])
 def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
-    from dreamer.replay import rows_for
+    from dreamer.experience.replay import rows_for
 
     paper, fast = find_preset("paper", task), find_preset("wallclock", task)
     assert paper.total_steps == {"corridor": 200_000, "obstacle_course": 22_000}[task] and paper.instances == 16
@@ -519,7 +519,7 @@ def test_a_decision_must_hold():
 
 def test_figures_and_limits_of_a_policy_are_computed_with_all_bits(monkeypatch):
     """As the vehicle's runtime does: a GPU would round the factors of a product to TF32."""
-    from whill_mjx.evaluation.novelty import SURPRISE
+    from whill_mjx.evaluation.policies.novelty import SURPRISE
     from whill_mjx.learning import outcome
 
     class Computed(Exception):

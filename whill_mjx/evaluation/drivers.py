@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from whill_mjx.env import Env, State
 from whill_mjx.evaluation.planner import first_plan, for_task, plan_action
-from whill_mjx.evaluation.policy_file import PolicyFile
+from whill_mjx.evaluation.policies.policy_file import PolicyFile
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from whill_mjx.env import make_env
 from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, random_driver
 from whill_mjx.evaluation.episodes import Course
 from whill_mjx.evaluation.options import EvaluateOptions
-from whill_mjx.evaluation.policy_file import PolicyFile, load_policy
-from whill_mjx.evaluation.policy_world import find_policy, trained_fields
+from whill_mjx.evaluation.policies.policy_file import PolicyFile, load_policy
+from whill_mjx.evaluation.policies.policy_world import find_policy, trained_fields
 from whill_mjx.evaluation.sweeps import Axis, parse_sweep
 from whill_mjx.io.command_line import check_once
 from whill_mjx.io.folders import RUN_FILE

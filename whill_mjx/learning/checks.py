@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dreamer import checkpoint, parallel
+from dreamer.training import checkpoint, parallel
 from whill_mjx.io.heartbeat import say
 from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.setup import Preset

@@ -34,7 +34,7 @@ def write_report(
     Pictures: drives.png and failures.png from above; camera.mp4 shows the first episodes, failures.mp4 the first that
     failed, `videos` of each at most. A line says what is left out because a package is missing.
     """
-    from whill_mjx.evaluation import pages
+    from whill_mjx.evaluation.output import pages
 
     episodes = driven["policy"]
     failed = np.flatnonzero(episodes.ends["success"] < 0.5)

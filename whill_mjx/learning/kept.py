@@ -12,8 +12,8 @@ from pathlib import Path
 
 import jax
 
-from dreamer import programs
-from dreamer.programs import Programs
+from dreamer.training import programs
+from dreamer.training.programs import Programs
 from whill_mjx.learning.identity import identity_of, vehicle_label
 from whill_mjx.learning.setup import Preset
 from whill_mjx.vehicle.vehicle_file import load_intervals, load_vehicle

@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dreamer.export import PolicyContract, SensingPolicy, export_policy, export_sensing
+from dreamer.policy_files.export import PolicyContract, SensingPolicy, export_policy, export_sensing
 from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import episode_keys
-from whill_mjx.evaluation.novelty import SURPRISE, largest_surprise, limits
-from whill_mjx.evaluation.policy_file import camera_contract, sensor_contract
+from whill_mjx.evaluation.policies.novelty import SURPRISE, largest_surprise, limits
+from whill_mjx.evaluation.policies.policy_file import camera_contract, sensor_contract
 from whill_mjx.io.formats import stamp
 from whill_mjx.io.heartbeat import say
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
@@ -32,7 +32,7 @@ def evaluate_policy(
     options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, stage: Stage = say
 ) -> dict[str, Any]:
     """Drive the final evaluation with the policy, the planner and random actions; write pictures and videos."""
-    from whill_mjx.evaluation import pictures
+    from whill_mjx.evaluation.output import pictures
 
     course = make_course(preset, vehicle)
     step, carry = policy_of(options, preset, course)

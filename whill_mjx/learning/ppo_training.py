@@ -12,10 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from dreamer import checkpoint
-from dreamer.programs import compiled, in_thread
-from dreamer.progress import Progress
 from dreamer.train import COMPILING, TrainingOptions, carry_out, copied
+from dreamer.training import checkpoint
+from dreamer.training.programs import compiled, in_thread
+from dreamer.training.progress import Progress
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.ppo import PpoConfig, PpoState, init_state, iterate

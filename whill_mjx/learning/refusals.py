@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dreamer import parallel
+from dreamer.training import parallel
 from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices
 from whill_mjx.env import make_env

@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer import agent as agents
 from dreamer.config import DreamerConfig
 from dreamer.config import preset as learner_preset
-from dreamer.iteration import check_fit
+from dreamer.experience.iteration import check_fit
+from dreamer.model import agent as agents
 from dreamer.types import FunctionalEnv, Mirror, Transition
 from whill_mjx.batch import BatchEnv, make_batch
 from whill_mjx.env import POSE_METRICS, Env, State, make_env
 from whill_mjx.evaluation.drivers import Driver
-from whill_mjx.evaluation.novelty import watched
+from whill_mjx.evaluation.policies.novelty import watched
 from whill_mjx.learning import ppo
 from whill_mjx.learning.ppo import PpoConfig
 from whill_mjx.learning.shaping import Safety, Step, limited_policy, limiter_of, penalty

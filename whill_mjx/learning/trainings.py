@@ -9,10 +9,10 @@ from typing import Any
 
 import jax
 
-from dreamer import checkpoint
 from dreamer.evaluate import Rounds, evaluate
-from dreamer.programs import Kept, Programs
 from dreamer.train import TrainingOptions, train
+from dreamer.training import checkpoint
+from dreamer.training.programs import Kept, Programs
 from whill_mjx.batch import BatchEnv
 from whill_mjx.devices import choose_devices
 from whill_mjx.evaluation.episodes import Course, episode_keys

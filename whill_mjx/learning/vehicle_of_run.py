@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from dreamer import checkpoint
+from dreamer.training import checkpoint
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.folders import RUN_FILE, Claim, FolderRefused, write_whole
 from whill_mjx.io.heartbeat import say

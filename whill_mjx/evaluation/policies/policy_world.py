@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.policy import AGENT_KIND, KIND, AgentContract, SensorInput, pacer_of, read_policy
-from whill_mjx.evaluation.policy_file import sensors_of, vehicle_file
+from whill_mjx.evaluation.policies.policy_file import sensors_of, vehicle_file
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.fields import PRESET, RUN, TASK, check, check_table
 from whill_mjx.io.folders import RUN_FILE

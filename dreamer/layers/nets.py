@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from dreamer.convolution import block_max, conv
-from dreamer.recurrence import keep
+from dreamer.layers.convolution import block_max, conv
+from dreamer.layers.recurrence import keep
 from dreamer.types import Params
 
 NORM_EPS = 1e-4

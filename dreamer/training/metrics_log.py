@@ -12,9 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from dreamer import parallel, pretrain
-from dreamer.board import Board
 from dreamer.config import DreamerConfig
+from dreamer.experience import pretrain
+from dreamer.training import parallel
+from dreamer.training.board import Board
 
 MetricsFn = Callable[[dict[str, float]], None]
 

@@ -30,7 +30,7 @@ def write_pictures(
     sweeps: list[Sweep],
 ) -> tuple[list[Path], list[Path]]:  # fmt: skip
     """Write pictures and videos; what cannot be written for want of a package is left out and said."""
-    from whill_mjx.evaluation import pages
+    from whill_mjx.evaluation.output import pages
 
     out, episodes = options.out, driven[main_name]
     failed = np.flatnonzero(episodes.ends["success"] < 0.5)

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from dreamer.config import DreamerConfig
-from dreamer.iteration import Metrics, TrainState, init_state, train_iteration
-from dreamer.programs import compile_lowered
+from dreamer.experience.iteration import Metrics, TrainState, init_state, train_iteration
+from dreamer.training.programs import compile_lowered
 from dreamer.types import FunctionalEnv, Params
 
 SHARED = (

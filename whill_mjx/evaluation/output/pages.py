@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from whill_mjx.evaluation.episodes import MEANS, OF_SUCCESSES, SHARES, Episodes, shares_of
-from whill_mjx.evaluation.pictures import _corners, _pyplot, _save
+from whill_mjx.evaluation.output.pictures import _corners, _pyplot, _save
 from whill_mjx.evaluation.sweeps import Sweep
 from whill_mjx.io import html
 from whill_mjx.io.fields import percent

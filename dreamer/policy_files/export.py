@@ -25,9 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from bridge.policy import AGENT_KIND, KIND, SCHEMA, AgentContract, PolicyFileError, read_policy
-from dreamer import agent, sensors, spaces, world_model
+from dreamer import spaces
 from dreamer.config import DreamerConfig
-from dreamer.network import OPSET, Carry, Network, Shapes, parity, to_onnx
+from dreamer.layers import sensors
+from dreamer.model import agent, world_model
+from dreamer.policy_files.network import OPSET, Carry, Network, Shapes, parity, to_onnx
 from dreamer.spaces import ActionSpec, Discrete, ObsShape
 from dreamer.types import Params
 
@@ -178,7 +180,7 @@ def export_agent(
     if bias.shape != (actions.outputs,):
         raise ValueError(f"params: the policy's last bias has the shape {bias.shape}, but {actions} needs "
                          f"({actions.outputs},). Give the action_dim of the training, and of several seeds one agent "
-                         "(dreamer.seeds.pick).")
+                         "(dreamer.training.seeds.pick).")
     converted = Converted.of(_network_of(config, params, obs_shape, actions), CHECK_STEPS)
     described = {name: list(one) for name, one in obs_shape.items()} if isinstance(obs_shape, Mapping) else obs_shape
     table = {

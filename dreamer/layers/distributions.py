@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer.recurrence import keep
+from dreamer.layers.recurrence import keep
 
 
 def symlog(x: jax.Array) -> jax.Array:

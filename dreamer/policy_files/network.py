@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dreamer import onnx_graph
+from dreamer.policy_files import onnx_graph
 
 OPSET = 18
 """ONNX operator set of the file. 18 is readable by onnxruntime 1.14 and newer, so also by a vehicle's older system."""

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dreamer import parallel
+from dreamer.training import parallel
 
 KEEP = 2
 LEAST_S, SHARE = 60.0, 0.05

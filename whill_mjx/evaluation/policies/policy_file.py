@@ -29,7 +29,7 @@ from bridge.policy import (
     show,
 )
 from whill_mjx.effects.base import apply_chain
-from whill_mjx.evaluation.onnx_network import Network
+from whill_mjx.evaluation.policies.onnx_network import Network
 from whill_mjx.sensors.base import Sensor
 from whill_mjx.sensors.camera import Camera
 from whill_mjx.sensors.registry import known_sensors

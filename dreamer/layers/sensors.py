@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dreamer import distributions as dist
-from dreamer import image, nets, parallel
 from dreamer.config import DreamerConfig
-from dreamer.rssm import Latent
+from dreamer.layers import distributions as dist
+from dreamer.layers import image, nets
+from dreamer.model.rssm import Latent
 from dreamer.spaces import ObsShape, image_of, image_shape, vector_of, vector_size
+from dreamer.training import parallel
 from dreamer.types import Params
 
 

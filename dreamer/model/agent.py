@@ -11,13 +11,16 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from dreamer import behavior, optim, parallel, rssm, sensors, spaces, world_model
-from dreamer import distributions as dist
-from dreamer.behavior import ReturnNorm
+from dreamer import spaces
 from dreamer.config import DreamerConfig
-from dreamer.replay import Batch
-from dreamer.rssm import Latent
+from dreamer.experience.replay import Batch
+from dreamer.layers import distributions as dist
+from dreamer.layers import sensors
+from dreamer.model import behavior, optim, rssm, world_model
+from dreamer.model.behavior import ReturnNorm
+from dreamer.model.rssm import Latent
 from dreamer.spaces import ActionSpec, ObsShape
+from dreamer.training import parallel
 from dreamer.types import Carry, Params
 
 

@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from dreamer import distributions as dist
-from dreamer import parallel, rssm, spaces, world_model
+from dreamer import spaces
 from dreamer.config import DreamerConfig
-from dreamer.rssm import Latent
+from dreamer.layers import distributions as dist
+from dreamer.model import rssm, world_model
+from dreamer.model.rssm import Latent
+from dreamer.training import parallel
 from dreamer.types import Params
 
 

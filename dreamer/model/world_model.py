@@ -5,12 +5,14 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from dreamer import distributions as dist
-from dreamer import nets, parallel, rssm, sensors
 from dreamer.config import DreamerConfig
-from dreamer.replay import Batch
-from dreamer.rssm import Latent
+from dreamer.experience.replay import Batch
+from dreamer.layers import distributions as dist
+from dreamer.layers import nets, sensors
+from dreamer.model import rssm
+from dreamer.model.rssm import Latent
 from dreamer.spaces import ObsShape
+from dreamer.training import parallel
 from dreamer.types import Params
 
 PARTS = ("enc", "dyn", "dec", "reward", "continue")

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from dreamer import agent as agents
 from dreamer.config import DreamerConfig
-from dreamer.iteration import Metrics, TrainState, collect, replayed_updates, sum_over
+from dreamer.experience.iteration import Metrics, TrainState, collect, replayed_updates, sum_over
+from dreamer.model import agent as agents
 from dreamer.types import FunctionalEnv
 
 UPDATES_PER_DISPATCH = 8

@@ -1,6 +1,6 @@
 """Replay memory: one ring of rows, each row holding the same step of all N instance streams.
 
-All of it lies on the device, or all but the observations (`dreamer.host_replay`).
+All of it lies on the device, or all but the observations (`dreamer.experience.host_replay`).
 
 Row t, column n is one step of stream n: the frame, what came with it, the action taken AFTER it, and the latent state
 inferred from it. A sampled window is consecutive rows of one column between the oldest and the newest row, so it
@@ -17,12 +17,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from dreamer import distributions as dist
-from dreamer import host_replay, parallel, spaces
+from dreamer import spaces
 from dreamer.config import DreamerConfig
-from dreamer.host_replay import HostFrames
-from dreamer.rssm import Latent
+from dreamer.experience import host_replay
+from dreamer.experience.host_replay import HostFrames
+from dreamer.layers import distributions as dist
+from dreamer.model.rssm import Latent
 from dreamer.spaces import ObsShape
+from dreamer.training import parallel
 from dreamer.types import Transition
 
 

@@ -13,11 +13,12 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from dreamer import checkpoint, host_replay, parallel, pretrain, replay, seeds
 from dreamer.config import DreamerConfig
-from dreamer.iteration import TrainState, compile_init
-from dreamer.metrics_log import write_atomically
-from dreamer.programs import Place, compiled
+from dreamer.experience import host_replay, pretrain, replay
+from dreamer.experience.iteration import TrainState, compile_init
+from dreamer.training import checkpoint, parallel, seeds
+from dreamer.training.metrics_log import write_atomically
+from dreamer.training.programs import Place, compiled
 from dreamer.types import FunctionalEnv
 
 

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from whill_mjx.env import Env, State, observe, reset_state, step_state
 from whill_mjx.env.view_from_above import top_view
+from whill_mjx.evaluation.output.rerun_log import RerunLog, step_with_terms
 from whill_mjx.evaluation.planner import PlannerConfig, first_plan, for_task, plan_action
-from whill_mjx.evaluation.rerun_log import RerunLog, step_with_terms
 from whill_mjx.io.folders import whole_file
 from whill_mjx.vehicle.types import VehicleParams
 

@@ -14,14 +14,17 @@ import numpy as np
 from flax import struct
 from jax.sharding import Mesh
 
-from dreamer import agent as agents
-from dreamer import exploration, parallel, replay, sensors, spaces
-from dreamer.agent import AgentState
+from dreamer import spaces
 from dreamer.config import LEAST_TRAIN_RATIO, DreamerConfig
-from dreamer.host_replay import HostFrames
-from dreamer.programs import compile_lowered
-from dreamer.replay import Batch, Replay
-from dreamer.rssm import Latent
+from dreamer.experience import exploration, replay
+from dreamer.experience.host_replay import HostFrames
+from dreamer.experience.replay import Batch, Replay
+from dreamer.layers import sensors
+from dreamer.model import agent as agents
+from dreamer.model.agent import AgentState
+from dreamer.model.rssm import Latent
+from dreamer.training import parallel
+from dreamer.training.programs import compile_lowered
 from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
 
 Metrics = dict[str, jax.Array]

@@ -7,9 +7,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from dreamer import nets
 from dreamer.config import DreamerConfig
-from dreamer.convolution import by_chunks
+from dreamer.layers import nets
+from dreamer.layers.convolution import by_chunks
 from dreamer.types import Params
 
 Shape = tuple[int, int, int]

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from dreamer import distributions as dist
-from dreamer import nets
 from dreamer.config import DreamerConfig
-from dreamer.recurrence import keep, scan_products
+from dreamer.layers import distributions as dist
+from dreamer.layers import nets
+from dreamer.layers.recurrence import keep, scan_products
 from dreamer.types import Params
 
 

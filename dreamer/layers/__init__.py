@@ -1,0 +1,1 @@
+"""Parts of networks: layers, convolutions, distributions, encoders and decoders."""

@@ -1,0 +1,1 @@
+"""The agent: recurrent model, world model, actor and critic, optimiser."""

@@ -1,0 +1,1 @@
+"""The policy file of a trained agent, and its ONNX network."""

@@ -1,0 +1,1 @@
+"""What a training run keeps: its first state, programs, devices, checkpoints, metrics."""

@@ -1,0 +1,1 @@
+"""What an evaluation leaves: pages, pictures, films, recordings for a viewer."""
