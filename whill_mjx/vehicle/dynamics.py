@@ -368,8 +368,8 @@ def softplus(value: jax.Array) -> jax.Array:
     logarithm of any number, a fifth of a whole step.
     """
     small = jnp.exp(-jnp.abs(value))
-    ratio: jax.Array | float = 0.0
-    for coefficient in reversed(LOG1P):
+    ratio = LOG1P[-2] + LOG1P[-1] * small
+    for coefficient in reversed(LOG1P[:-2]):
         ratio = ratio * small + coefficient
     return jnp.maximum(value, 0.0) + small * ratio
 
