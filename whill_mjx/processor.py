@@ -32,6 +32,7 @@ VECTORS = "-vectorize-memory-check-threshold=4096"
 FLAG = "--xla_backend_extra_options"
 WIDE = "--xla_cpu_prefer_vector_width"
 DEVICES = Path("/dev")
+ACCELERATORS = ("nvidia[0-9]*", "nvhost*", "dxg", "kfd", "accel*", "vfio/[0-9]*")  # NVIDIA's, also under WSL; AMD's; TPUs
 
 
 def share_results() -> None:
@@ -51,10 +52,10 @@ def share_results() -> None:
 
 
 def no_accelerator() -> bool:
-    """Whether JAX will compute on the host: it was asked to, or there is no NVIDIA, AMD or Google device."""
+    """Whether JAX will compute on the host: it was asked to, or there is no device of `ACCELERATORS`."""
     if asked := os.environ.get("JAX_PLATFORMS"):
         return asked == "cpu"
-    return not any(any(DEVICES.glob(device)) for device in ("nvidia[0-9]*", "kfd", "accel*", "vfio/[0-9]*"))
+    return not any(any(DEVICES.glob(device)) for device in ACCELERATORS)
 
 
 def _has_wide_vectors() -> bool:
