@@ -32,7 +32,7 @@ VECTORS = "-vectorize-memory-check-threshold=4096"
 FLAG = "--xla_backend_extra_options"
 WIDE = "--xla_cpu_prefer_vector_width"
 DEVICES = Path("/dev")
-ACCELERATORS = ("nvidia[0-9]*", "nvhost*", "dxg", "kfd", "accel*", "vfio/[0-9]*")  # NVIDIA's, also under WSL; AMD's; TPUs
+ACCELERATORS = ("nvidia[0-9]*", "nvhost*", "dxg", "kfd", "accel*", "vfio/[0-9]*")  # NVIDIA, also under WSL, AMD, TPU
 
 
 def share_results() -> None:
@@ -42,13 +42,13 @@ def share_results() -> None:
     first program, and afterwards this changes nothing. Results are the same without it, but for the last bits.
     Accelerators ignore it. XLA aborts with it on some programs of plain MJX.
     """
-    own = [f"{FLAG}={OPTION}", f"{FLAG}={OPTION},{VECTORS}"]
-    wanted = {FLAG: own[no_accelerator()].removeprefix(f"{FLAG}=")} | ({WIDE: "512"} if _has_wide_vectors() else {})
+    with_accelerator, alone = f"{FLAG}={OPTION}", f"{FLAG}={OPTION},{VECTORS}"
+    own = alone if no_accelerator() else with_accelerator
     # What a process that started this one has asked for may be for an accelerator that is not used here.
-    words = os.environ.get("XLA_FLAGS", "").split()
-    flags = " ".join(own[no_accelerator()] if word in own else word for word in words)
-    missing = [f"{name}={value}" for name, value in wanted.items() if name not in flags]
-    os.environ["XLA_FLAGS"] = " ".join([flags, *missing]).strip()
+    words = [own if word in (with_accelerator, alone) else word for word in os.environ.get("XLA_FLAGS", "").split()]
+    wanted = [own, f"{WIDE}=512"] if _has_wide_vectors() else [own]
+    missing = [word for word in wanted if not any(word.split("=")[0] in given for given in words)]
+    os.environ["XLA_FLAGS"] = " ".join([*words, *missing])
 
 
 def no_accelerator() -> bool:
