@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from dreamer.policy_files.export import PolicyContract, export_policy
+from dreamer import PolicyContract, export_policy
 
 
 def step(carry, image):

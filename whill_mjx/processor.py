@@ -30,6 +30,7 @@ from typing import Any
 OPTION = "xla_cpu_use_multi_output_fusion"
 VECTORS = "-vectorize-memory-check-threshold=4096"
 FLAG = "--xla_backend_extra_options"
+OWN = (f"{FLAG}={OPTION}", f"{FLAG}={OPTION},{VECTORS}")  # beside an accelerator, and without one
 WIDE = "--xla_cpu_prefer_vector_width"
 DEVICES = Path("/dev")
 ACCELERATORS = ("nvidia[0-9]*", "nvhost*", "dxg", "kfd", "accel*", "vfio/[0-9]*")  # NVIDIA, also under WSL, AMD, TPU
@@ -42,10 +43,9 @@ def share_results() -> None:
     first program, and afterwards this changes nothing. Results are the same without it, but for the last bits.
     Accelerators ignore it. XLA aborts with it on some programs of plain MJX.
     """
-    with_accelerator, alone = f"{FLAG}={OPTION}", f"{FLAG}={OPTION},{VECTORS}"
-    own = alone if no_accelerator() else with_accelerator
+    own = OWN[no_accelerator()]
     # What a process that started this one has asked for may be for an accelerator that is not used here.
-    words = [own if word in (with_accelerator, alone) else word for word in os.environ.get("XLA_FLAGS", "").split()]
+    words = [own if word in OWN else word for word in os.environ.get("XLA_FLAGS", "").split()]
     wanted = [own, f"{WIDE}=512"] if _has_wide_vectors() else [own]
     missing = [word for word in wanted if not any(word.split("=")[0] in given for given in words)]
     os.environ["XLA_FLAGS"] = " ".join([*words, *missing])
@@ -86,19 +86,14 @@ def cores() -> int:
 
 def shares_results() -> bool:
     """Whether XLA_FLAGS ask for it."""
-    return any(map(_asks, os.environ.get("XLA_FLAGS", "").split()))
+    return any(word in OWN for word in os.environ.get("XLA_FLAGS", "").split())
 
 
 def keep_results_apart() -> None:
     """Take back `share_results`, which a process that started this one may have called."""
     if shares_results():
         words = os.environ["XLA_FLAGS"].split()
-        os.environ["XLA_FLAGS"] = " ".join(word for word in words if not _asks(word))
-
-
-def _asks(word: str) -> bool:
-    """Whether a word of XLA_FLAGS asks for shared results."""
-    return word.startswith(f"{FLAG}=") and OPTION in word.removeprefix(f"{FLAG}=").split(",")
+        os.environ["XLA_FLAGS"] = " ".join(word for word in words if word not in OWN)
 
 
 def as_one_function(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -6,13 +6,10 @@ import os
 import sys
 import threading
 from contextlib import suppress
-from pathlib import Path
 
 from whill_mjx.devices import launched_processes
 from whill_mjx.io.compiled import keep_compiled
-from whill_mjx.processor import share_results
-
-DEVICES = Path("/dev")
+from whill_mjx.processor import DEVICES, share_results
 
 
 def wake_gpu() -> threading.Thread | None:
