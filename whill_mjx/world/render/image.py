@@ -8,6 +8,7 @@ images are drawn in blocks (`blocks`), and the tables are complete before the fi
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -240,6 +241,9 @@ class Arrays:
         if tables.round_shadow is not None:
             dark = dark | _any_shadow(visibility.round_shadow, tables.round_shadow, x, y, z)
         return dark
+
+    def where_some(self, condition, compute: Callable, otherwise) -> Any:
+        return compute()  # all pixels are drawn together
 
     def _picture(self, number, s, t) -> list:
         count, size, _ = self.atlas.shape  # type: ignore[union-attr]

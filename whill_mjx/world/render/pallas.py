@@ -96,6 +96,22 @@ class Kind(NamedTuple):
     shadow: jax.Array | None
 
 
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """An array of numbers in memory; each is loaded where it is asked for, so that none waits in a register."""
+
+    memory: Any
+    places: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.places.shape
+
+    def __getitem__(self, index: Any) -> Any:
+        places = self.places[index]
+        return Numbers(self.memory, places) if np.ndim(places) else self.memory[int(places)]
+
+
 class Tile(NamedTuple):
     """A part of the image [pixels]."""
 
@@ -117,13 +133,12 @@ def render_pallas(
     Args:
         position, rotation, intrinsics, scene, quality: as `render`; `quality.keep` has no meaning here,
             for nothing is left out.
-        tiling: how the image is cut; None takes larger tiles for plain looks. Rich ones take a pixel per thread,
-            whose many numbers then fit into the registers.
+        tiling: how the image is cut; None takes smaller tiles where a pixel needs more numbers.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton as plt
 
-    tiling = tiling or (Tiling() if scene.rich is None else Tiling(8, 4))
+    tiling = tiling or _suitable_tiling(scene, quality)
     height, width = intrinsics.height, intrinsics.width
     inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
     leaves, tree = jax.tree.flatten(inputs)
@@ -136,8 +151,8 @@ def render_pallas(
         tile = pl.program_id(0)
         top, left = tile // across * tiling.rows, tile % across * tiling.columns
         shape = (tiling.rows, tiling.columns)
-        row = top + jax.lax.broadcasted_iota(jnp.int32, shape, 0)
-        column = left + jax.lax.broadcasted_iota(jnp.int32, shape, 1)
+        pixel = jax.lax.iota(jnp.int32, tiling.rows * tiling.columns)  # in a row: Triton moves no pixel between threads
+        row, column = top + pixel // tiling.columns, left + pixel % tiling.columns
         data = jax.tree.unflatten(tree, read)
         view = rebuild(data)
         rows, columns = row.astype(jnp.float32), column.astype(jnp.float32)
@@ -146,7 +161,7 @@ def render_pallas(
         colours = pixel_colours(view, stage, quality, rows, columns)
         word = jnp.where(data.integers[1] != 0, pack_channels(stage, colours), np.uint32(0))
         inside = None if whole else (row < height) & (column < width)
-        _write(out, (pl.ds(top, tiling.rows), pl.ds(left, tiling.columns)), word, inside, tiling.words)
+        _write(out, (row, column), word, inside, tiling.words)
 
     drawn = jax.ShapeDtypeStruct(
         (height, width) if tiling.words else (height, width, 3), jnp.uint32 if tiling.words else jnp.uint8
@@ -161,6 +176,13 @@ def render_pallas(
     )
     image = call(*leaves)
     return unpack_colours(image) if tiling.words else image
+
+
+def _suitable_tiling(scene: Scene, quality: Quality) -> Tiling:
+    """Tiles whose numbers fit into the registers: the more a pixel needs, the fewer pixels share a thread."""
+    if scene.rich is not None:
+        return Tiling(8, 4)
+    return Tiling(8, 8) if quality.antialias or quality.shadows else Tiling()
 
 
 def _static(scene: Scene, tiling: Tiling) -> dict[str, Any]:
@@ -178,7 +200,6 @@ def _static(scene: Scene, tiling: Tiling) -> dict[str, Any]:
 
 def _write(out: Any, here: tuple[Any, Any], word: jax.Array, inside: jax.Array | None, words: bool) -> None:
     """Write a tile's colours, as words or as three bytes a pixel; only those `inside` the image, if some are not."""
-    from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton as plt
 
     if words:
@@ -186,8 +207,7 @@ def _write(out: Any, here: tuple[Any, Any], word: jax.Array, inside: jax.Array |
         return
     for channel in range(3):
         level = (word >> np.uint32(8 * channel) & np.uint32(255)).astype(jnp.int32).astype(jnp.uint8)
-        mask = None if inside is None else inside[..., None]
-        plt.store(out.at[(*here, pl.ds(channel, 1))], level[..., None], mask=mask)
+        plt.store(out.at[(*here, channel)], level, mask=inside)
 
 
 def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort: bool) -> tuple[Inputs, Callable]:
@@ -218,17 +238,11 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort
         values, offset = [], 0
         for index, shape in enumerate(shapes):
             size = int(np.prod(shape))
-            scalars = [data.floats[offset + i] for i in range(size)]
-            offset += size
             if index == where_seed:
                 values.append(data.integers[0].astype(jnp.uint32))
-            elif shape == ():
-                values.append(scalars[0])
             else:
-                array = np.empty(size, object)
-                for place, scalar in enumerate(scalars):  # a slice would ask the scalars for their values
-                    array[place] = scalar
-                values.append(array.reshape(shape))
+                values.append(Numbers(data.floats, offset + np.arange(size).reshape(shape))[()])
+            offset += size
         return jax.tree.unflatten(tree, values)
 
     atlas = None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.reshape(-1)
@@ -446,6 +460,10 @@ class Refs:
 
             dark = self._visit(kind.shadow_bounds, None, meet, dark)
         return dark > 0
+
+    def where_some(self, condition, compute: Callable, otherwise) -> Any:
+        some = jnp.max(condition.astype(jnp.int32)) > 0
+        return jax.lax.cond(some, lambda: jax.tree.map(jnp.asarray, compute()), lambda: otherwise)
 
     def _picture(self, number, s, t) -> list:
         count, size, _ = self.atlas_shape  # type: ignore[misc]

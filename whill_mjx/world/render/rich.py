@@ -6,6 +6,7 @@ its label, so that a pixel costs the same whatever it shows. Elementwise, shared
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 
 from whill_mjx.world.render.textures import random_cell, smooth_noise
 from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
+from whill_mjx.world.rich import HIGHEST
 
 NUMBERS = 26
 """Numbers of a material in the table."""
@@ -46,8 +48,10 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
     paint, tone = stage.settle(_paint(stage, Surface(row, m, label, point, pixel), seed))
-    light = stage.settle(_light(lights, normal, point))
-    gleam = m[25] * _mirror(lights, rays, point, facing) * jnp.where(normal[2] > 0.9, 1.0, 0.0)
+    light = stage.settle(_light(lights, normal, point, stage.where_some))
+    glossy = jnp.where(seen & (normal[2] > 0.9), m[25], 0.0)
+    mirror = stage.where_some(glossy > 0.0, lambda: _mirror(lights, rays, point, facing), jnp.zeros_like(glossy))
+    gleam = glossy * mirror
     looks, height = view.looks, jnp.clip(rays.z * length, 0.0, 1.0)
     colours = []
     for channel in range(3):
@@ -99,13 +103,19 @@ def _paint(stage: Any, surface: Surface, seed: jax.Array) -> tuple[list, jax.Arr
     return paint, jnp.maximum(jnp.where(banded, 1.0 + 0.5 * m[17] * blotch, tone * (1.0 - joint)), 0.0)
 
 
-def _light(lights, normal, point) -> list:
+def _everywhere(condition, compute: Callable, otherwise) -> Any:
+    """As `Stage.where_some`, skipping nothing."""
+    return compute()
+
+
+def _light(lights, normal, point, where_some: Callable = _everywhere) -> list:
     """Light on a surface, for each channel: ambient, lamps, soft shadows near the floor, and a patch of sunlight."""
     x, y, z = point
     sky = 0.8 + 0.2 * normal[2]
     near = jnp.clip((lights.half_width - jnp.abs(y)) * 4.0, 0.0, 1.0)
     corner = jnp.where(normal[2] > 0.5, 0.75 + 0.25 * near, 0.78 + 0.22 * jnp.clip(z * 4.0, 0.0, 1.0))
-    open_ = corner * shadow_factor(lights.caster, x, y, z)
+    one = jnp.ones_like(x)
+    open_ = corner * where_some(z < HIGHEST, lambda: shadow_factor(lights.caster, x, y, z), one)
     light = [lights.ambient[i] * sky * open_ for i in range(3)]
     for lamp in range(lights.position.shape[0]):
         to = [lights.position[lamp, axis] - point[axis] for axis in range(3)]
@@ -114,6 +124,14 @@ def _light(lights, normal, point) -> list:
         cosine = (to[0] * normal[0] + to[1] * normal[1] + to[2] * normal[2]) * inverse
         strength = jnp.maximum(WRAP + (1.0 - WRAP) * cosine, 0.05) * inverse * inverse * open_
         light = [light[i] + strength * lights.colour[lamp, i] for i in range(3)]
+    sunny = (lights.sunlight[0] > 0.0) & (x == x)
+    patch = where_some(sunny, lambda: _sun_patch(lights, normal, point), jnp.zeros_like(x))
+    return [light[i] + patch * lights.sunlight[i] for i in range(3)]
+
+
+def _sun_patch(lights, normal, point) -> jax.Array:
+    """Share of the sunlight that falls through the window onto a surface."""
+    x, y, z = point
     back = jnp.abs(lights.window[0] - y) / jnp.abs(lights.sun[1])  # way back to the plane of the window
     beside = jnp.abs(x + back * lights.sun[0] - lights.window[1])
     above = jnp.abs(z + back * lights.sun[2] - lights.window[2])
@@ -121,8 +139,7 @@ def _light(lights, normal, point) -> list:
     inside = inside * jnp.clip((lights.window[4] - above) * 12.0, 0.0, 1.0)
     inside = inside * jnp.clip(beside * 20.0 - 0.3, 0.0, 1.0)  # the bar in the middle of the window
     cosine = normal[0] * lights.sun[0] + normal[1] * lights.sun[1] + normal[2] * lights.sun[2]
-    patch = inside * jnp.maximum(cosine, 0.0)
-    return [light[i] + patch * lights.sunlight[i] for i in range(3)]
+    return inside * jnp.maximum(cosine, 0.0)
 
 
 def shadow_factor(casters, x, y, z) -> jax.Array:

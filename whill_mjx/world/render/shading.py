@@ -6,6 +6,7 @@ primitive is nearest, what a table says about a face, whether a point lies in sh
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -121,6 +122,10 @@ class Stage(Protocol):
     def shadow(self, x, y, z) -> Any:
         """Bool: is a point hidden from the sun?"""
 
+    def where_some(self, condition, compute: Callable, otherwise) -> Any:
+        """`compute()`, or `otherwise`, of the same shapes, where the condition holds for no pixel that is drawn with
+        this one. So the two must not differ where the condition does not hold, or nothing may read them there."""
+
 
 def cast(view: View, stage: Stage, rays: Rays) -> Hit:
     """What these rays meet."""
@@ -145,13 +150,15 @@ def pixel_colours(view: View, stage: Stage, quality: Quality, row, column) -> li
     mask = (1 << stage.bits) - 1
     front, back = jnp.min(key, 0), jnp.max(key, 0)
     share = jnp.sum(jnp.where((key & mask) == (front & mask)[None], 0.25, 0.0), 0)
-    share = jnp.where(front & mask == back & mask, 0.5, share)  # one surface: its nearest and its farthest sample
-    colours = []
-    for chosen in (front, back):
+
+    def colours_of(chosen) -> list:
         first = jnp.min(jnp.where(key == chosen[None], sample, len(SAMPLES)), 0)
         one = pixel_view(view, stage, row, column, _place(first))
-        colours.append(shade(view, stage, quality, one, _hit_of(view, stage, one, chosen)))
-    return [share * a + (1.0 - share) * b for a, b in zip(*colours, strict=True)]
+        return shade(view, stage, quality, one, _hit_of(view, stage, one, chosen))
+
+    nearest = colours_of(front)  # the only one where all samples meet one surface: its share is 1
+    behind = stage.where_some(share < 1.0, lambda: colours_of(back), nearest)
+    return [share * a + (1.0 - share) * b for a, b in zip(nearest, behind, strict=True)]
 
 
 def _place(sample) -> tuple:
