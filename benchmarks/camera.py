@@ -59,12 +59,6 @@ class Options:
     """Calls per repeat on an accelerator, so that the launch of a call does not count; a CPU makes 2."""
     repeats: Annotated[int, COUNT] = 7
     """Timed repeats."""
-    rows: Annotated[int, COUNT] = 8
-    """Rows of the kernel's tiles."""
-    columns: Annotated[int, COUNT] = 16
-    """Columns of the kernel's tiles."""
-    warps: Annotated[int, COUNT] = 1
-    """Warps per tile."""
     keep: Annotated[int, COUNT] = 64
     """Walls that the jnp renderer keeps in each strip of the map's image."""
 
@@ -168,17 +162,14 @@ def main(options: Options) -> None:
 
 def kernel_jobs(options: Options) -> list[tuple[str, Any, Any]]:
     """Name of the figure, function and scene of each measurement of the kernel."""
-    tiling = Tiling(options.rows, options.columns, options.warps)
-    kernel = partial(_draw_kernel, tiling=tiling)
     jobs: list[tuple[str, Any, Any]] = []
     if "crowd" in options.parts:
-        jobs.append(("frames_per_s_32box_16384", kernel, crowded_scene))
+        jobs.append(("frames_per_s_32box_16384", _draw_kernel, crowded_scene))
     if "best" in options.parts:
-        jobs.append(("frames_per_s_aa_shadow", partial(kernel, quality=BEST), crowded_scene))
+        jobs.append(("frames_per_s_aa_shadow", partial(_draw_kernel, quality=BEST), crowded_scene))
     if "map" in options.parts:
-        ordered = dataclasses.replace(tiling, sort=True)
-        jobs.append(("frames_per_s_map", kernel, map_scene))
-        jobs.append(("frames_per_s_map_sorted", partial(_draw_kernel, tiling=ordered), map_scene))
+        jobs.append(("frames_per_s_map", _draw_kernel, map_scene))
+        jobs.append(("frames_per_s_map_sorted", partial(_draw_kernel, tiling=Tiling(sort=True)), map_scene))
     if "tilings" in options.parts:
         for one in TILINGS:
             switches = f"{'' if one.fast else '_exact'}{'_words' if one.words else ''}{'' if one.cull else '_all'}"

@@ -17,7 +17,6 @@ from whill_mjx.world.rich import (
     DOOR,
     FLOOR,
     FRAME,
-    HIGHEST,
     LAMP,
     LIGHTS,
     MARKER,
@@ -255,7 +254,7 @@ def _casters(draw: Draws, scene: Scene, position, power) -> jax.Array:
     share = weight / jnp.sum(weight, 1, keepdims=True)
     shift = jnp.sum((share / high)[..., None] * offset, 1) * draw(0.4, 1.2)
     strength = draw(0.2, 0.85) * solid.mask
-    height = jnp.minimum(2.0 * solid.half[:, 2], HIGHEST)
+    height = jnp.minimum(2.0 * solid.half[:, 2], 1.0)
     return jnp.concatenate([
         solid.centre[:, :2], jnp.cos(solid.yaw)[:, None], jnp.sin(solid.yaw)[:, None], solid.half[:, :2],
         height[:, None], jnp.clip(shift, -1.2, 1.2), strength[:, None],

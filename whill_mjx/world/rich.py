@@ -26,8 +26,6 @@ PASSAGE = 0.95
 """Width that is left free between things, walls and obstacles [m]."""
 DEEP = (0.08, 0.38)
 """How far things reach from the wall into the room [m]."""
-HIGHEST = 1.0
-"""Height above which nothing throws a soft shadow [m]."""
 FLOOR, MARKER, WALL, OBSTACLE, THING, PANEL, CEILING, LAMP, FRAME, DOOR, POSTER, WINDOW, POLE, TOP = range(14)
 PERSON = 14
 """Roles: what a label is to the room."""

@@ -7,6 +7,7 @@ distorts, so that they hold for every lens.
 from __future__ import annotations
 
 from functools import reduce
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,101 +37,137 @@ class Bounds:
     near: jax.Array  # m: no point of it has less depth
 
 
-WIDER = (jnp.minimum, jnp.maximum) * 2
-"""Of two rectangles' sides, in the order of `Bounds`."""
-
-Corners = tuple[jax.Array, jax.Array, jax.Array]
-"""World x, y and z of the corners of P bodies, each (2, ..., 2, P): corners whose places differ in one of the axes of
-size 2 are joined by an edge."""
+Point = tuple[jax.Array, jax.Array, jax.Array]
 
 
-def upright_corners(boxes: Boxes) -> Corners:
-    """Eight corners of upright boxes."""
-    c, s = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
-    zero = jnp.zeros_like(c)
-    ways = [(c, s, zero), (-s, c, zero), (zero, zero, zero + 1.0)]
-    return _corners(boxes.centre, ways, [boxes.half[:, axis] for axis in range(3)])
+class Body(NamedTuple):
+    """P bodies by their centres and the ways from there to three faces: a corner is the centre and all three ways, each
+    taken forwards or backwards."""
+
+    centre: Point  # world x, y, z, each (P,)
+    ways: tuple[Point, Point, Point]
 
 
-def block_corners(blocks: Blocks) -> Corners:
-    """Eight corners of blocks."""
-    ways = [tuple(blocks.rotation[:, row, axis] for row in range(3)) for axis in range(3)]
-    return _corners(blocks.centre, ways, [blocks.half[:, axis] for axis in range(3)])
+class Eye(NamedTuple):
+    """Where the camera is, and the sun where shadows are asked for."""
+
+    position: Any  # (3,)
+    rotation: Any  # (3, 3) camera to world
+    sun: Any = None  # (3,) unit vector towards it
 
 
-def round_corners(rounds: Rounds) -> Corners:
-    """Eight corners of the box around each round: square to the axis, as long as the round with its ends."""
+def upright_body(boxes: Boxes) -> Body:
+    """Upright boxes."""
+    c, s, zero = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw), jnp.zeros_like(boxes.yaw)
+    x, y, z = boxes.half.T
+    return Body(tuple(boxes.centre.T), ((c * x, s * x, zero), (-s * y, c * y, zero), (zero, zero, z)))  # type: ignore
+
+
+def block_body(blocks: Blocks) -> Body:
+    """Blocks."""
+    ways = [tuple((blocks.rotation[:, :, axis] * blocks.half[:, axis, None]).T) for axis in range(3)]
+    return Body(tuple(blocks.centre.T), tuple(ways))  # type: ignore
+
+
+def round_body(rounds: Rounds) -> Body:
+    """The box around each round: square to its axis, as long as the round with its ends."""
     axis, one = rounds.axis, across(rounds.axis)
-    other = jnp.cross(axis, one)
     long = rounds.half + jnp.where(rounds.capsule, rounds.radius, 0.0)
-    ways = [tuple(way[:, row] for row in range(3)) for way in (one, other, axis)]
-    return _corners(rounds.centre, ways, [rounds.radius, rounds.radius, long])
-
-
-def _corners(centre, ways, half) -> Corners:
-    signs = [np.array([-1.0, 1.0], np.float32).reshape(shape) for shape in ((2, 1, 1, 1), (2, 1, 1), (2, 1))]
-
-    def along(row: int) -> jax.Array:
-        reach = [sign * size * way[row] for sign, size, way in zip(signs, half, ways, strict=True)]
-        return centre[:, row] + reach[0] + reach[1] + reach[2]
-
-    return along(0), along(1), along(2)
+    sizes = (one, rounds.radius), (jnp.cross(axis, one), rounds.radius), (axis, long)
+    return Body(tuple(rounds.centre.T), tuple(tuple((way * size[:, None]).T) for way, size in sizes))  # type: ignore
 
 
 def upright_bounds(view: View, boxes: Boxes) -> Bounds:
     """Rectangles of upright boxes."""
-    return bounds(view, upright_corners(boxes), boxes.mask)
+    return bounds(Eye(view.position, view.rotation), upright_body(boxes), boxes.mask)
 
 
-def shadow_corners(corners: Corners, sun: jax.Array) -> Corners:
-    """The corners, and where the sun throws them on the ground; their hull holds the shadowed space."""
-    x, y, z = corners
-    thrown = np.array([0.0, 1.0], np.float32).reshape(2, *[1] * z.ndim)
-    fall = thrown * jnp.maximum(z, 0.0) * (1.0 / jnp.maximum(sun[2], LOWEST_SUN))
-    return x - fall * sun[0], y - fall * sun[1], z - fall * sun[2]
+def bounds(eye: Eye, body: Body, mask: jax.Array) -> Bounds:
+    """Rectangles of bodies; `mask` (P,). With a sun they hold the space in shadow too, down to the ground."""
+    count = corner_count(eye)
+    sides = corner_sides(eye, body, corner_signs(np.arange(count)[:, None], count))  # each (count, P)
+    return shown_bounds(Sides(*(pick(one, 0) for pick, one in zip(ALL_OF, sides, strict=True))), mask)
 
 
-def bounds(view: View, corners: Corners, mask: jax.Array) -> Bounds:
-    """Rectangles of convex bodies with these `corners`; `mask` (P,).
+def corner_count(eye: Eye) -> int:
+    """Corners of a body, each also where the sun throws it on the ground."""
+    return 8 if eye.sun is None else 16
 
-    Corners are axes of arrays, reduced in loops. Written out one by one, they became one kernel of two minutes to
-    compile.
-    """
-    way = [place - origin for place, origin in zip(corners, view.position, strict=True)]
-    x, y, z = (sum(way[row] * view.rotation[row, axis] for row in range(3)) for axis in range(3))
-    ways = tuple(range(z.ndim - 1))
-    inverse, before = 1.0 / jnp.maximum(z, NEAREST), z >= NEAREST
+
+def corner_signs(number, count: int) -> list:
+    """Directions 1 or -1 of a corner along the three ways, by its number, and 1 or 0: thrown on the ground or not."""
+    bits = [(number >> axis) & 1 for axis in range(4 if count > 8 else 3)]
+    return [*(2.0 * bit - 1.0 for bit in bits[:3]), *(1.0 * bit for bit in bits[3:])]
+
+
+class Sides(NamedTuple):
+    """What corners and the edges that leave them add to a rectangle."""
+
+    low_u: Any
+    high_u: Any
+    low_v: Any
+    high_v: Any
+    near: Any
+    cut: Any  # float, 1 where an edge leads behind the camera
+
+
+WIDER = (jnp.minimum, jnp.maximum, jnp.minimum, jnp.maximum, jnp.minimum, jnp.maximum)
+"""Of two rectangles' Sides."""
+ALL_OF = (jnp.min, jnp.max, jnp.min, jnp.max, jnp.min, jnp.max)
+"""The same of many."""
+NO_SIDES = Sides(NOTHING, -NOTHING, NOTHING, -NOTHING, NOTHING, 0.0)
+
+
+def corner_sides(eye: Eye, body: Body, signs: list) -> Sides:
+    """The corner of these signs, and where the edges from it to its neighbours pass the plane at NEAREST."""
+    x, y, z = _corner(eye, body, signs)
+    before = z >= NEAREST
+    inverse = 1.0 / jnp.maximum(z, NEAREST)
     sides = [_sides(x * inverse, y * inverse, before)]
-    cut_through = jnp.zeros_like(mask)
-    for axis in ways:
-        (x1, x2), (y1, y2), (z1, z2) = (_ends(place, axis) for place in (x, y, z))
-        rise = z2 - z1
-        share = jnp.clip((NEAREST - z1) / jnp.where(jnp.abs(rise) < 1e-9, 1e-9, rise), 0.0, 1.0)
-        crosses = (z1 >= NEAREST) != (z2 >= NEAREST)
-        u, v = ((one + share * (other - one)) * (1.0 / NEAREST) for one, other in ((x1, x2), (y1, y2)))
+    cut = jnp.zeros_like(z)
+    for axis, sign in enumerate(signs):
+        other = [*signs[:axis], -sign if axis < 3 else 1.0 - sign, *signs[axis + 1 :]]
+        x2, y2, z2 = _corner(eye, body, other)
+        crosses = before & (z2 < NEAREST)  # an edge counts at its end before the camera
+        share = (z - NEAREST) / jnp.maximum(z - z2, 1e-9)
+        u, v = ((one + share * (end - one)) * (1.0 / NEAREST) for one, end in ((x, x2), (y, y2)))
         sides.append(_sides(u, v, crosses))
-        cut_through = cut_through | crosses.any(ways[:-1])
-    near = jnp.where(before, z, NOTHING).min(ways)
-    near = jnp.where(cut_through, 0.0, near * (1.0 - 1e-5))
-    shown = mask & (near < 0.5 * NOTHING)
-    empty = (NOTHING, -NOTHING, NOTHING, -NOTHING, NOTHING)
-    widest = [reduce(pick, every) for pick, every in zip(WIDER, zip(*sides, strict=True), strict=True)]
-    return Bounds(*(jnp.where(shown, value, nothing) for value, nothing in zip([*widest, near], empty, strict=True)))
+        cut = jnp.where(crosses, 1.0, cut)
+    pairs = zip(WIDER[:4], zip(*sides, strict=True), strict=True)
+    low_u, high_u, low_v, high_v = (reduce(pick, every) for pick, every in pairs)
+    return Sides(low_u, high_u, low_v, high_v, jnp.where(before, z, NOTHING), cut)
 
 
-def _ends(places: jax.Array, axis: int) -> tuple[jax.Array, jax.Array]:
-    """Both ends of the edges along an axis of size 2."""
-    return jax.lax.index_in_dim(places, 0, axis, False), jax.lax.index_in_dim(places, 1, axis, False)
+def _corner(eye: Eye, body: Body, signs: list) -> tuple:
+    """x, y, z of a corner in the camera's axes."""
+    place = [
+        body.centre[row] + signs[0] * body.ways[0][row] + signs[1] * body.ways[1][row] + signs[2] * body.ways[2][row]
+        for row in range(3)
+    ]
+    if eye.sun is not None:
+        fall = signs[3] * jnp.maximum(place[2], 0.0) / jnp.maximum(eye.sun[2], LOWEST_SUN)
+        place = [place[row] - fall * eye.sun[row] for row in range(3)]
+    way = [place[row] - eye.position[row] for row in range(3)]
+    return tuple(
+        way[0] * eye.rotation[0, axis] + way[1] * eye.rotation[1, axis] + way[2] * eye.rotation[2, axis]
+        for axis in range(3)
+    )
 
 
-def _sides(u: jax.Array, v: jax.Array, used: jax.Array) -> tuple[jax.Array, ...]:
-    """Smallest and largest u, then v, of the used ones of places (2, ..., 2, P), with some room for rounding."""
+def _sides(u: jax.Array, v: jax.Array, used: jax.Array) -> tuple:
+    """u and v as both ends of a rectangle, with some room for rounding; of nothing where not `used`."""
     sides = []
     for place in (u, v):
         slack = 1e-5 * (1.0 + jnp.abs(place))
-        sides.append(jnp.where(used, place - slack, NOTHING).min(range(place.ndim - 1)))
-        sides.append(jnp.where(used, place + slack, -NOTHING).max(range(place.ndim - 1)))
+        sides += [jnp.where(used, place - slack, NOTHING), jnp.where(used, place + slack, -NOTHING)]
     return tuple(sides)
+
+
+def shown_bounds(sides: Sides, mask: jax.Array) -> Bounds:
+    """The rectangles; empty where nothing is before the camera."""
+    near = jnp.where(sides.cut > 0, 0.0, sides.near * (1.0 - 1e-5))
+    shown = mask & (near < 0.5 * NOTHING)
+    return Bounds(*(jnp.where(shown, one, nothing) for one, nothing in zip((*sides[:4], near), NO_SIDES, strict=False)))
 
 
 def strip_lists(boxes: Bounds, view: View, strips: int, keep: int) -> jax.Array:

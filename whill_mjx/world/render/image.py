@@ -20,6 +20,7 @@ from whill_mjx.world.render import visibility
 from whill_mjx.world.render.blocks import in_blocks
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.render.culling import strip_lists, upright_bounds
+from whill_mjx.world.render.rich import shadow_factor
 from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
 from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal, larger, smaller
@@ -241,6 +242,9 @@ class Arrays:
         if tables.round_shadow is not None:
             dark = dark | _any_shadow(visibility.round_shadow, tables.round_shadow, x, y, z)
         return dark
+
+    def soft_shadow(self, casters, x, y, z) -> jax.Array:
+        return shadow_factor(casters, x, y, z)
 
     def where_some(self, condition, compute: Callable, otherwise) -> Any:
         return compute()  # all pixels are drawn together

@@ -20,7 +20,7 @@ from flax import struct
 from whill_mjx.world.render import culling, visibility
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
-from whill_mjx.world.render.rich import NUMBERS
+from whill_mjx.world.render.rich import CASTER, NUMBERS, caster_factor, caster_reach
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
 from whill_mjx.world.render.tables import lit_words, make_tables, parts_of
 from whill_mjx.world.render.textures import whole
@@ -29,6 +29,8 @@ from whill_mjx.world.scene import Scene
 
 CHUNK = 32
 """Rectangles compared at once: the bits of an integer."""
+FOUR = 4
+"""Numbers that a thread loads at once: 16 bytes."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Listed:
     bounds: Any  # (5, P padded to CHUNK): low u, high u, low v, high v, near
     order: Any  # (P padded,) int32 place in the table, front to back; None: as they are
     shadow: Any  # (P, m) numbers of the shadow test, or None
-    shadow_bounds: Any  # (4, P padded) or None
+    shadow_bounds: Any  # (5, P padded) or None
 
 
 @struct.dataclass
@@ -81,11 +83,11 @@ class Inputs:
     integers: Any  # (2,) seed, and whether the pose is finite
     words: Any  # (labels * 4,)
     dark: Any
-    rows: Any  # (labels * 4 * 18,)
-    bent: Any  # (K * 4 * 8,)
+    rows: Any  # lines of 18 numbers, as `_flat` lays them
+    bent: Any  # of 8
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
-    materials: Any = None  # (labels * NUMBERS,) of rich looks
+    materials: Any = None  # of NUMBERS; None without rich looks
 
 
 class Kind(NamedTuple):
@@ -93,6 +95,7 @@ class Kind(NamedTuple):
 
     table: Any  # (N, numbers)
     mask: jax.Array
+    body: culling.Body
     shadow: jax.Array | None
 
 
@@ -140,7 +143,7 @@ def render_pallas(
 
     tiling = tiling or _suitable_tiling(scene, quality)
     height, width = intrinsics.height, intrinsics.width
-    inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling.sort)
+    inputs, rebuild = _inputs(position, rotation, intrinsics, scene, quality, tiling)
     leaves, tree = jax.tree.flatten(inputs)
     static = _static(scene, tiling)
     down, across = -(-height // tiling.rows), -(-width // tiling.columns)
@@ -210,21 +213,21 @@ def _write(out: Any, here: tuple[Any, Any], word: jax.Array, inside: jax.Array |
         plt.store(out.at[(*here, channel)], level, mask=inside)
 
 
-def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort: bool) -> tuple[Inputs, Callable]:
+def _inputs(
+    position, rotation, intrinsics, scene: Scene, quality: Quality, tiling: Tiling
+) -> tuple[Inputs, Callable]:
     """Arrays for the kernel, and the function that makes the view of them there."""
     view, finite = make_view(position, rotation, intrinsics, scene)
     parts = parts_of(scene)
     tables = make_tables(view, parts, scene, quality.shadows)
-    sun, corners = scene.looks.sun, {}
-    kinds = {"upright": Kind(tables.upright, parts.boxes.mask, tables.upright_shadow)}
-    corners["upright"] = culling.upright_corners(parts.boxes)
-    if parts.blocks is not None:
-        kinds["block"] = Kind(tables.block, parts.blocks.mask, tables.block_shadow)
-        corners["block"] = culling.block_corners(parts.blocks)
-    if parts.rounds is not None:
-        kinds["round"] = Kind(tables.round, parts.rounds.mask, tables.round_shadow)
-        corners["round"] = culling.round_corners(parts.rounds)
-    listed = {name: _listed(view, corners[name], sun, kind, sort) for name, kind in kinds.items()}
+    boxes, blocks, rounds = parts.boxes, parts.blocks, parts.rounds
+    kinds = {"upright": Kind(tables.upright, boxes.mask, culling.upright_body(boxes), tables.upright_shadow)}
+    if blocks is not None:
+        kinds["block"] = Kind(tables.block, blocks.mask, culling.block_body(blocks), tables.block_shadow)
+    if rounds is not None:
+        kinds["round"] = Kind(tables.round, rounds.mask, culling.round_body(rounds), tables.round_shadow)
+    eye = culling.Eye(view.position, view.rotation, scene.looks.sun)
+    listed = {name: _listed(eye, kind, tiling) for name, kind in kinds.items()}
 
     seed = view.looks.seed.astype(jnp.uint32)
     integers = jnp.stack([jax.lax.bitcast_convert_type(seed, jnp.int32), finite.astype(jnp.int32)])
@@ -247,35 +250,65 @@ def _inputs(position, rotation, intrinsics, scene: Scene, quality: Quality, sort
 
     atlas = None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.reshape(-1)
     dark = None if tables.dark is None else tables.dark.reshape(-1)
-    rows = None if lit_words(scene) or tables.rows is None else tables.rows.reshape(-1)
-    bent = None if tables.bent is None else tables.bent.reshape(-1)
-    materials = None if tables.materials is None else tables.materials.reshape(-1)
+    rows = None if lit_words(scene) else _flat(tables.rows)
+    bent, materials = _flat(tables.bent), _flat(tables.materials)
     floats, words = jnp.concatenate(flat), tables.words.reshape(-1)
     return Inputs(floats, integers, words, dark, rows, bent, atlas, listed, materials), rebuild
 
 
-def _listed(view: View, corners, sun, kind: Kind, sort: bool) -> Listed:
+def _listed(eye: culling.Eye, kind: Kind, tiling: Tiling) -> Listed:
     """Rectangles of one kind, padded to whole chunks; with `sort` in front-to-back order where there are several."""
-    table, mask, shadow = kind
-    count = table.shape[0]
-    extra = -count % CHUNK
-    boxes = culling.bounds(view, corners, mask)
-    order = None
-    if sort and count > CHUNK:
-        order = jnp.argsort(boxes.near)
-        boxes = jax.tree.map(lambda leaf: leaf[order], boxes)
-        order = jnp.pad(order.astype(jnp.int32), (0, extra))
+    count = kind.table.shape[0]
+    sides, order = _rectangles(eye._replace(sun=None), kind, tiling.interpret), None
+    if tiling.sort and count > CHUNK:
+        order = jnp.argsort(sides[4]).astype(jnp.int32)  # the padding is at depth NOTHING
+        sides = sides[:, order]
+        order = jnp.minimum(order, count - 1)
+    shadows = None if kind.shadow is None else _rectangles(eye, kind, tiling.interpret)
+    return Listed(kind.table, sides, order, kind.shadow, shadows)
 
-    def pad(values):
-        empty = [culling.NOTHING, -culling.NOTHING, culling.NOTHING, -culling.NOTHING, culling.NOTHING]
-        return jnp.stack([jnp.pad(v, (0, extra), constant_values=e) for v, e in zip(values, empty, strict=False)])
 
-    sides = (boxes.low_u, boxes.high_u, boxes.low_v, boxes.high_v)
-    dark = None
-    if shadow is not None:
-        cast = culling.bounds(view, culling.shadow_corners(corners, sun), mask)
-        dark = pad((cast.low_u, cast.high_u, cast.low_v, cast.high_v))
-    return Listed(table, pad((*sides, boxes.near)), order, shadow, dark)
+def _rectangles(eye: culling.Eye, kind: Kind, interpret: bool) -> jax.Array:
+    """(5, P padded) `culling.bounds` of one kind, by a kernel that takes a primitive per thread.
+
+    XLA would compute all corners anew for each of the five results, or write them to memory.
+    """
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton as plt
+
+    body, extra = kind.body, -kind.mask.shape[0] % CHUNK
+    lines = [*body.centre, *body.ways[0], *body.ways[1], *body.ways[2], kind.mask.astype(jnp.float32)]
+    table = jnp.pad(jnp.stack(lines), ((0, 0), (0, extra)))
+    given = [eye.position, eye.rotation.reshape(-1), *([] if eye.sun is None else [eye.sun])]
+    count = culling.corner_count(eye)
+
+    def kernel(table, pose, out):
+        lanes = pl.ds(pl.program_id(0) * CHUNK, CHUNK)
+        line = [table[i, lanes] for i in range(len(lines))]
+        numbers = Numbers(pose, np.arange(12 if count == 8 else 15))
+        sun = None if count == 8 else numbers[12:]
+        own = culling.Eye(numbers[:3], Numbers(pose, np.arange(3, 12).reshape(3, 3)), sun)
+        bodies = culling.Body(tuple(line[:3]), (tuple(line[3:6]), tuple(line[6:9]), tuple(line[9:12])))  # type: ignore
+
+        def one(number, widest):
+            signs = [sign.astype(jnp.float32) for sign in culling.corner_signs(number, count)]
+            new = culling.corner_sides(own, bodies, signs)
+            pairs = zip(culling.WIDER, widest, new, strict=True)
+            return culling.Sides(*(pick(old, other) for pick, old, other in pairs))
+
+        nothing = culling.Sides(*(jnp.full((CHUNK,), one, jnp.float32) for one in culling.NO_SIDES))
+        sides = jax.lax.fori_loop(0, count, one, nothing)
+        for i, leaf in enumerate(jax.tree.leaves(culling.shown_bounds(sides, line[12] > 0.0))):
+            out[i, lanes] = leaf
+
+    return pl.pallas_call(
+        kernel,
+        out_shape=jax.ShapeDtypeStruct((5, table.shape[1]), jnp.float32),
+        grid=(table.shape[1] // CHUNK,),
+        compiler_params=plt.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+        name="rectangles",
+    )(table, jnp.concatenate(given))
 
 
 def _first_labels(scene: Scene) -> dict[str, int]:
@@ -298,6 +331,42 @@ def _tile_limits(view: View, quality: Quality, row, column, tile: Tile) -> tuple
         pairs = zip((jnp.minimum, jnp.maximum) * 2, limits or new, new, strict=True)
         limits = tuple(pick(old, other) for pick, old, other in pairs)
     return limits  # type: ignore[return-value]
+
+
+def _each(hit: jax.Array, meet: Callable, carry: Any) -> Any:
+    """`carry` after `meet(lane, carry)` for each of CHUNK lanes that `hit`."""
+    lane = jax.lax.iota(jnp.int32, CHUNK)
+    waiting = jnp.sum(jnp.where(hit, np.int32(1) << lane, np.int32(0)))
+
+    def one(state):
+        waiting, carry = state
+        lowest = waiting & -waiting
+        return waiting ^ lowest, meet(jax.lax.population_count(lowest - 1), carry)
+
+    return jax.lax.while_loop(lambda state: state[0] != 0, one, (waiting, carry))[1]
+
+
+def _steps(values: jax.Array, extreme: Callable) -> jax.Array:
+    """A bound of lengths [m] from whole steps of 1/64 m, of which a warp finds the extreme in one instruction."""
+    whole = extreme(jnp.floor(values * 64.0).astype(jnp.int32)) + (1 if extreme is jnp.max else 0)
+    return whole.astype(jnp.float32) * (1.0 / 64.0)
+
+
+def _flat(table: jax.Array | None) -> jax.Array | None:
+    """The lines (K, n) of a table one after the other, each padded to whole FOURs."""
+    return None if table is None else jnp.pad(table, ((0, 0), (0, -table.shape[1] % FOUR))).reshape(-1)
+
+
+def _line(memory: Any, place: jax.Array, count: int) -> list:
+    """The `count` numbers of line `place` (N,) in a `_flat` table, each (N,); FOUR are loaded at once."""
+    wide, lane = count + -count % FOUR, jax.lax.iota(jnp.int32, FOUR)
+    numbers = []
+    for first in range(0, wide, FOUR):
+        bits = jax.lax.bitcast_convert_type(memory[place[:, None] * wide + (first + lane)[None]], jnp.int32)
+        for one in range(FOUR):  # a sum of integers: of one thread's four numbers it takes one, at no cost
+            picked = jnp.sum(jnp.where(lane[None] == one, bits, 0), 1)
+            numbers.append(jax.lax.bitcast_convert_type(picked, jnp.float32))
+    return numbers[:count]
 
 
 def _fast_reciprocal(x):
@@ -388,7 +457,6 @@ class Refs:
 
         chunks = bounds.shape[-1] // CHUNK
         low_u, high_u, low_v, high_v = self.limits
-        lane = jax.lax.iota(jnp.int32, CHUNK)
 
         def one_chunk(chunk, carry):
             lanes = pl.ds(chunk * CHUNK, CHUNK)
@@ -399,15 +467,12 @@ class Refs:
             if self.cull and farthest is not None and chunks > 1:
                 near = jax.lax.bitcast_convert_type(bounds[4, lanes], jnp.int32)
                 hit = hit & (near <= farthest(carry))
-            waiting = jnp.sum(jnp.where(hit, np.int32(1) << lane, np.int32(0)))
 
-            def one(state):
-                waiting, carry = state
-                lowest = waiting & -waiting
-                place = chunk * CHUNK + jax.lax.population_count(lowest - 1)
-                return waiting ^ lowest, meet(place if order is None else order[place], carry)
+            def one(number, carry):
+                place = chunk * CHUNK + number
+                return meet(place if order is None else order[place], carry)
 
-            return jax.lax.while_loop(lambda state: state[0] != 0, one, (waiting, carry))[1]
+            return _each(hit, one, carry)
 
         if chunks == 1:
             return one_chunk(0, carry)
@@ -420,13 +485,13 @@ class Refs:
         return self.data.dark[code]
 
     def row(self, code) -> list:
-        return [self.data.rows[code * 18 + index] for index in range(18)]
+        return _line(self.data.rows, code, 18)
 
     def material(self, label) -> list:
-        return [self.data.materials[label * NUMBERS + index] for index in range(NUMBERS)]
+        return _line(self.data.materials, label, NUMBERS)
 
     def bent(self, place) -> list:
-        return [self.data.bent[place * 8 + index] for index in range(8)]
+        return _line(self.data.bent, place, 8)
 
     def ratio(self, x, y) -> jax.Array:
         if jnp.ndim(y) == 0:
@@ -460,6 +525,24 @@ class Refs:
 
             dark = self._visit(kind.shadow_bounds, None, meet, dark)
         return dark > 0
+
+    def soft_shadow(self, casters: Numbers, x, y, z) -> jax.Array:
+        lane, count = jax.lax.iota(jnp.int32, CHUNK), casters.shape[0]
+        low, high = [_steps(one, jnp.min) for one in (x, y, z)], [_steps(one, jnp.max) for one in (x, y)]
+        factor = jnp.ones_like(x)
+        for first in range(0, count, CHUNK):
+            here = jnp.minimum(first + lane, count - 1) * CASTER
+            c = [casters.memory[int(casters.places[0, i]) + here] for i in range(CASTER)]
+            hit = (first + lane < count) & (low[2] < c[6]) & (c[9] > 0.0)
+            for axis, reach in enumerate(caster_reach(c)):
+                hit = hit & (c[axis] - reach < high[axis]) & (c[axis] + reach > low[axis])
+
+            def shade(place, factor, first=first):
+                where = int(casters.places[0, 0]) + (first + place) * CASTER
+                return factor * caster_factor([casters.memory[where + i] for i in range(CASTER)], x, y, z)
+
+            factor = _each(hit, shade, factor)
+        return factor
 
     def where_some(self, condition, compute: Callable, otherwise) -> Any:
         some = jnp.max(condition.astype(jnp.int32)) > 0

@@ -14,10 +14,13 @@ import jax.numpy as jnp
 
 from whill_mjx.world.render.textures import random_cell, smooth_noise
 from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
-from whill_mjx.world.rich import HIGHEST
 
 NUMBERS = 26
 """Numbers of a material in the table."""
+CASTER = 10
+"""Numbers of a thing that throws a soft shadow."""
+NEAR_SHADOW, FAR_SHADOW = 0.06, 0.35
+"""Width of the edge of a soft shadow at the thing's top [m], and its growth per metre below."""
 WRAP = 0.3
 """Share of a lamp's light that comes around corners: lamps are wide, and walls throw light back."""
 
@@ -48,7 +51,7 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
     paint, tone = stage.settle(_paint(stage, Surface(row, m, label, point, pixel), seed))
-    light = stage.settle(_light(lights, normal, point, stage.where_some))
+    light = stage.settle(_light(lights, normal, point, stage))
     glossy = jnp.where(seen & (normal[2] > 0.9), m[25], 0.0)
     mirror = stage.where_some(glossy > 0.0, lambda: _mirror(lights, rays, point, facing), jnp.zeros_like(glossy))
     gleam = glossy * mirror
@@ -103,19 +106,25 @@ def _paint(stage: Any, surface: Surface, seed: jax.Array) -> tuple[list, jax.Arr
     return paint, jnp.maximum(jnp.where(banded, 1.0 + 0.5 * m[17] * blotch, tone * (1.0 - joint)), 0.0)
 
 
-def _everywhere(condition, compute: Callable, otherwise) -> Any:
-    """As `Stage.where_some`, skipping nothing."""
-    return compute()
+class _Everywhere:
+    """A `Stage` as far as light asks it, which skips nothing."""
+
+    @staticmethod
+    def where_some(condition, compute: Callable, otherwise) -> Any:
+        return compute()
+
+    @staticmethod
+    def soft_shadow(casters, x, y, z) -> jax.Array:
+        return shadow_factor(casters, x, y, z)
 
 
-def _light(lights, normal, point, where_some: Callable = _everywhere) -> list:
+def _light(lights, normal, point, stage: Any = _Everywhere) -> list:
     """Light on a surface, for each channel: ambient, lamps, soft shadows near the floor, and a patch of sunlight."""
     x, y, z = point
     sky = 0.8 + 0.2 * normal[2]
     near = jnp.clip((lights.half_width - jnp.abs(y)) * 4.0, 0.0, 1.0)
     corner = jnp.where(normal[2] > 0.5, 0.75 + 0.25 * near, 0.78 + 0.22 * jnp.clip(z * 4.0, 0.0, 1.0))
-    one = jnp.ones_like(x)
-    open_ = corner * where_some(z < HIGHEST, lambda: shadow_factor(lights.caster, x, y, z), one)
+    open_ = corner * stage.soft_shadow(lights.caster, x, y, z)
     light = [lights.ambient[i] * sky * open_ for i in range(3)]
     for lamp in range(lights.position.shape[0]):
         to = [lights.position[lamp, axis] - point[axis] for axis in range(3)]
@@ -125,7 +134,7 @@ def _light(lights, normal, point, where_some: Callable = _everywhere) -> list:
         strength = jnp.maximum(WRAP + (1.0 - WRAP) * cosine, 0.05) * inverse * inverse * open_
         light = [light[i] + strength * lights.colour[lamp, i] for i in range(3)]
     sunny = (lights.sunlight[0] > 0.0) & (x == x)
-    patch = where_some(sunny, lambda: _sun_patch(lights, normal, point), jnp.zeros_like(x))
+    patch = stage.where_some(sunny, lambda: _sun_patch(lights, normal, point), jnp.zeros_like(x))
     return [light[i] + patch * lights.sunlight[i] for i in range(3)]
 
 
@@ -146,15 +155,27 @@ def shadow_factor(casters, x, y, z) -> jax.Array:
     """Share of the light that things leave to a point: soft, darkest at their foot, and away from the lamps."""
     factor = jnp.ones_like(x)
     for index in range(casters.shape[0]):
-        c = [casters[index, i] for i in range(10)]
-        rise = jnp.maximum(c[6] - z, 0.0)  # of the thing above the point
-        dx, dy = x - c[0] - 0.5 * rise * c[7], y - c[1] - 0.5 * rise * c[8]
-        along, across = jnp.abs(dx * c[2] + dy * c[3]), jnp.abs(dy * c[2] - dx * c[3])
-        reach = 0.5 * rise * jnp.maximum(jnp.abs(c[7]), jnp.abs(c[8]))
-        out = jnp.maximum(along - c[4] - reach, across - c[5] - reach)
-        soft = jnp.clip(1.0 - out / (0.06 + 0.35 * rise), 0.0, 1.0)
-        factor = factor * (1.0 - c[9] * soft * soft * jnp.minimum(rise * 4.0, 1.0))
+        factor = factor * caster_factor([casters[index, i] for i in range(CASTER)], x, y, z)
     return factor
+
+
+def caster_factor(c: list, x, y, z) -> jax.Array:
+    """The share that one thing leaves, from its CASTER numbers."""
+    rise = jnp.maximum(c[6] - z, 0.0)  # of the thing above the point
+    dx, dy = x - c[0] - 0.5 * rise * c[7], y - c[1] - 0.5 * rise * c[8]
+    along, across = jnp.abs(dx * c[2] + dy * c[3]), jnp.abs(dy * c[2] - dx * c[3])
+    reach = 0.5 * rise * jnp.maximum(jnp.abs(c[7]), jnp.abs(c[8]))
+    out = jnp.maximum(along - c[4] - reach, across - c[5] - reach)
+    soft = jnp.clip(1.0 - out / (NEAR_SHADOW + FAR_SHADOW * rise), 0.0, 1.0)
+    return 1.0 - c[9] * soft * soft * jnp.minimum(rise * 4.0, 1.0)
+
+
+def caster_reach(c: list) -> tuple:
+    """How far from a thing's place (c[0], c[1]) its shadow can be, along x and y [m]; it is below c[6]."""
+    aside = 0.5 * c[6] * jnp.maximum(jnp.abs(c[7]), jnp.abs(c[8])) + NEAR_SHADOW + FAR_SHADOW * c[6]
+    long, wide, cos, sin = c[4] + aside, c[5] + aside, jnp.abs(c[2]), jnp.abs(c[3])
+    x, y = cos * long + sin * wide, sin * long + cos * wide
+    return x + 0.5 * c[6] * jnp.abs(c[7]), y + 0.5 * c[6] * jnp.abs(c[8])
 
 
 def _mirror(lights, rays: Rays, point, facing) -> jax.Array:

@@ -122,6 +122,9 @@ class Stage(Protocol):
     def shadow(self, x, y, z) -> Any:
         """Bool: is a point hidden from the sun?"""
 
+    def soft_shadow(self, casters, x, y, z) -> Any:
+        """Share of the light that things leave to points: see `rich.shadow_factor`."""
+
     def where_some(self, condition, compute: Callable, otherwise) -> Any:
         """`compute()`, or `otherwise`, of the same shapes, where the condition holds for no pixel that is drawn with
         this one. So the two must not differ where the condition does not hold, or nothing may read them there."""
