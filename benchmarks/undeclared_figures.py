@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import json
 import math
@@ -43,8 +44,14 @@ SAME = {  # effects that the plant and the catalogue write alike: parameter, its
 
 
 def figures(work: Path, driven: Driven = USUAL) -> None:
-    """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept."""
-    cases = [(truth, one) for truth, one in read_cases(work) if bool(one.get("draw", 0)) == bool(driven.draw)]
+    """Write into benchmarks/results/undeclared.json what the verdicts in the work folder say; the rest is kept.
+
+    Fresh draws are counted together with recorded ones of the same stages that this decision judged.
+    """
+    recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
+    own = [(truth, one) for truth, one in read_cases(work) if bool(one.get("draw", 0)) == bool(driven.draw)]
+    kept, earlier = _recorded_rows(recorded.get("confusion", []), own, driven)
+    cases = [*own, *map(_case_of, earlier)]
     noisy = [(truth, one) for truth, one in cases if one["stage"] == "noisy"]
     cases = [(truth, one) for truth, one in cases if one["stage"] != "noisy"]
     found = {**of_nulls([one for truth, one in cases if not truth]), **of_noisy(noisy)}
@@ -69,21 +76,53 @@ def figures(work: Path, driven: Driven = USUAL) -> None:
     found.update({} if driven.draw else of_speed(work))
     found.update(of_decision([one["findings"] for _, one in [*cases, *noisy] if one.get("findings")]))
     found = {name + driven.tag: one for name, one in found.items()}
-    recorded = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
     sizes = {name: {"value": size, "unit": EFFECTS[name].unit, "base": EFFECTS[name].base}
              for name, size in power_sizes(work).items()} if driven == USUAL else recorded.get("sizes", {})
     path = record("undeclared", "Undeclared effects in logs of an independent contact plant", found)
     content = {**json.loads(path.read_text()), "sizes": sizes}
-    cases += noisy  # others may have been judged in another folder
-    judged = {_kind(truth, one["stage"]) for truth, one in cases}
-    kept = [row for row in recorded.get("confusion", [])
-            if _kind(row["truth"], row["stage"]) not in judged or driven_of(row).tag != driven.tag]
-    content["confusion"] = kept + [
-        {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": driven.noise,
-         "vehicle": driven.vehicle, "draw": one.get("draw", 0), "verdict": one["verdict"],
-         "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
-         "explained": one["share"], "sensor_noise": one.get("noise", 1.0)} for truth, one in cases]
+    # Others may have been judged in another folder.
+    content["confusion"] = [*kept, *earlier, *(_row_of(truth, one, driven) for truth, one in own)]
     write_report(path, content)
+
+
+def _recorded_rows(rows: Sequence[Any], own: Sequence[Case], driven: Driven) -> tuple[list[Any], list[Any]]:
+    """Recorded rows that stay as they are, and those of other fresh draws that count beside the `own` logs."""
+    judged, draws = {_kind(truth, one["stage"]) for truth, one in own}, {one.get("draw", 0) for _, one in own}
+    stay, count = [], []
+    for row in rows:
+        same = driven_of(row).tag == driven.tag and _kind(row["truth"], row["stage"]) in judged
+        if not same:
+            stay.append(row)
+        elif row.get("draw", 0) not in draws | {0} and row.get("decision", decision_now()) == decision_now():
+            count.append(row)
+    return stay, count
+
+
+def decision_now() -> str:
+    """The beginning of the checksum of the source that decides."""
+    return hashlib.sha256(inspect.getsource(decision).encode()).hexdigest()[:12]
+
+
+def _row_of(truth: Mapping[str, float], one: Mapping[str, Any], driven: Driven) -> dict[str, Any]:
+    """What is recorded of a log."""
+    row = {"truth": truth, "stage": one["stage"], "scale": one["scale"], "noise": driven.noise,
+           "vehicle": driven.vehicle, "draw": one.get("draw", 0), "verdict": one["verdict"],
+           "named": [e["name"] for e in one["effects"]], "classes": [e["class"] for e in one["effects"]],
+           "explained": one["share"], "sensor_noise": one.get("noise", 1.0)}
+    if not driven.draw:
+        return row
+    sizes = {e["name"]: e["parameters"] for e in one["effects"] if e["name"] in truth and e["name"] in SAME}
+    levels = {"noise_levels": one["noise_levels"]} if one["stage"] == "noisy" and not truth else {}
+    return {**row, "decision": decision_now(), "reference": one.get("reference", 0), "p_value": one["p_value"],
+            "warned": warned(one), "parameters": sizes, **levels}
+
+
+def _case_of(row: Mapping[str, Any]) -> Case:
+    """A row as the verdict that it is of; the first rows lack warning, p-value and parameters."""
+    sizes = row.get("parameters", {})
+    effects = [{"name": name, "class": members, "parameters": sizes.get(name)}
+               for name, members in zip(row["named"], row["classes"], strict=True)]
+    return row["truth"], {**row, "noise": row["sensor_noise"], "share": row["explained"], "effects": effects}
 
 
 def driven_of(row: Mapping[str, Any]) -> Driven:
@@ -123,7 +162,7 @@ def of_nulls(nulls: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "false_alarms": {**figure([float(false)], f"of {len(nulls)} logs with nothing in them"), "n": len(nulls),
                          "sets": sets_of(nulls)},
         "false_alarm_upper": figure([upper_rate(false, len(nulls))], "share")}
-    apart = [one for one in nulls if not calibrates(one)]
+    apart = [one for one in nulls if "p_value" in one and not calibrates(one)]
     for name, p_of in (("null_ks_p", calibrated), ("null_ks_p_uncalibrated", float)):
         if apart:
             p_values = [p_of(one["p_value"]) for one in apart]
@@ -151,7 +190,7 @@ def of_noisy_nulls(nulls: Sequence[dict[str, Any]], tag: str, level: str) -> dic
     false, about = sum(one["verdict"] != "none" for one in nulls), (
         f"logs with nothing in them at {level} of the reference days")
     inside = [each["interval"][0] <= one["noise"] <= each["interval"][1]
-              for one in nulls for each in one["noise_levels"].values()]
+              for one in nulls for each in one.get("noise_levels", {}).values()]
     return {f"false_alarms{tag}": {**figure([float(false)], f"of {len(nulls)} {about}"), "n": len(nulls),
                                    "sets": sets_of(nulls)},
             f"false_alarm_upper{tag}": figure([upper_rate(false, len(nulls))], f"share of {about}"),
@@ -202,9 +241,10 @@ def of_singles(inside: Sequence[tuple[str, dict[str, Any]]], tag: str) -> dict[s
         wrong = [one["verdict"] == "named" and not ok for (_, one), ok in zip(known, right, strict=True)]
         found[f"class_accuracy{tag}"] = share(right, about)
         right_ones = [one for (_, one), ok in zip(known, right, strict=True) if ok]
+        if certain := [warned(one) for one in right_ones if knows_warnings(one)]:
+            found[f"warned_right{tag}"] = share(certain,
+                                                f"share of {len(certain)} right names that come with a warning")
         if right_ones:
-            found[f"warned_right{tag}"] = share([warned(one) for one in right_ones],
-                                                f"share of {len(right_ones)} right names that come with a warning")
             found[f"further_name{tag}"] = share([len(one["effects"]) > 1 for one in right_ones],
                                                 f"share of {len(right_ones)} right names with a further effect")
         found[f"wrong_name{tag}"] = share(wrong, about)
@@ -233,10 +273,17 @@ def of_pairs(pairs: Sequence[Case]) -> dict[str, Any]:
             "pair_wrong": share([not one for one in clean], f"share of {len(pairs)} logs with a wrong name")}
 
 
-def warned(one: dict[str, Any]) -> bool:
+def warned(one: Mapping[str, Any]) -> bool:
     """Whether a name comes with a warning (`sysid.follow_up.trust.warnings`); one is that more is left than days differ
     by; older verdicts contain that too."""
+    if "warned" in one:
+        return bool(one["warned"])
     return one["verdict"] == "named" and (bool(one.get("warnings")) or one["excess"][1] > one["excess_limit"])
+
+
+def knows_warnings(one: Mapping[str, Any]) -> bool:
+    """Whether a verdict, or what is recorded of one, says if its name came with a warning."""
+    return "warned" in one or "excess" in one
 
 
 def own_classes(work: Path) -> dict[str, set[str]]:
@@ -259,9 +306,10 @@ def of_left_out(inside: Sequence[tuple[str, dict[str, Any]]], own: Mapping[str, 
     outside = [one["verdict"] == "named" and not any(
         ({*alike["classes"][name]} | own.get(name, set())) & set(effect["class"]) for effect in one["effects"])
         for name, one in inside]
-    wrong = [bad and not warned(one) for bad, (_, one) in zip(outside, inside, strict=True)]
+    wrong = [bad and not warned(one) for bad, (_, one) in zip(outside, inside, strict=True) if knows_warnings(one)]
     about = f"share of {len(inside)} logs whose effect was taken out of the catalogue"
-    return {"left_out_wrong": share(wrong, about),
+    certain = f"share of {len(wrong)} logs whose effect was taken out of the catalogue"
+    return {**({"left_out_wrong": share(wrong, certain)} if wrong else {}),
             "left_out_outside_class": share(outside, about),
             "left_out_unexplained": share([one["verdict"] == "unexplained" for _, one in inside], about)}
 

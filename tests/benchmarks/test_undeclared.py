@@ -111,13 +111,45 @@ def test_logs_of_later_draws_have_figures_of_their_own_beside_those_of_the_first
         judged(tmp_path, f"null_000_draw_{draw}", {**NOTHING, "draw": draw}, {})
     undeclared_figures.figures(tmp_path, Driven(draw=1))
     after = json.loads(results.read_text())
-    assert after["figures"]["false_alarms_fresh"]["unit"] == "of 2 logs with nothing in them"
+    before = [row["draw"] for row in recorded["confusion"] if row["stage"] == "null" and row.get("draw", 0)]
+    count = len(before) + 2  # fresh draws count together
+    assert after["figures"]["false_alarms_fresh"]["unit"] == f"of {count} logs with nothing in them"
     assert after["figures"]["false_alarms"] == recorded["figures"]["false_alarms"]
     assert after["sizes"] == recorded["sizes"]
     nulls = [row["draw"] for row in after["confusion"] if row["stage"] == "null" and row.get("draw", 0)]
-    assert nulls == [1, 2]  # those recorded before are of logs judged anew
+    assert nulls == [*before, 1, 2]
     first = [row for row in recorded["confusion"] if not row.get("draw", 0)]
     assert [row for row in after["confusion"] if not row.get("draw", 0)] == first
+
+
+@pytest.mark.quick
+def test_fresh_draws_count_together_as_long_as_the_same_decision_judged_them(tmp_path, results):
+    size = {"slope.along_x": {"value": 0.1, "interval": [0.09, 0.11]}}
+    effect = {"name": "slope", "class": ["slope"], "parameters": size}
+    wrong = {**NOTHING, "stage": "scaled", "scale": 4.0, "verdict": "unexplained", "excess": [0.5, 0.1],
+             "excess_limit": 0.2}
+    right = {**wrong, "verdict": "named", "effects": [effect]}
+
+    def collected(draw, said):
+        work = tmp_path / str(draw)
+        work.mkdir()
+        judged(work, f"slope_draw_{draw}", {**said, "draw": draw}, {"slope": 0.1})
+        undeclared_figures.figures(work, Driven(draw=draw))
+        return json.loads(results.read_text())["figures"]
+
+    content = json.loads(results.read_text())
+    content["confusion"] = [row for row in content["confusion"] if not row.get("draw", 0)]
+    results.write_text(json.dumps(content))
+    assert collected(1, right)["class_accuracy_4x_fresh"]["n"] == 1
+    found = collected(2, wrong)
+    assert (found["class_accuracy_4x_fresh"]["value"], found["class_accuracy_4x_fresh"]["n"]) == (0.5, 2)
+    assert found["interval_coverage_fresh"]["n"] == found["warned_right_4x_fresh"]["n"] == 1  # of the first draw
+    content = json.loads(results.read_text())
+    assert {row["draw"] for row in content["confusion"] if row.get("draw")} == {1, 2}
+    for row in content["confusion"]:
+        row |= {"decision": "another"} if row.get("draw") == 1 else {}
+    results.write_text(json.dumps(content))
+    assert collected(3, right)["class_accuracy_4x_fresh"]["n"] == 2  # draws 2 and 3
 
 
 @pytest.mark.quick
