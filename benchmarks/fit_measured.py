@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.fit_scores import evaluate, gains, show, show_parameters
 from benchmarks.harness import figure, record
-from sysid.logs.measured import split
+from sysid.logs.loaders import split
 from sysid.logs.published.drive_norlab import load_drive
 from sysid.logs.published.mrclam import load_mrclam
 from sysid.logs.records import Log, Trial

@@ -164,7 +164,7 @@ def slow_unicycle() -> Any:
 def fitted_error(robot: Robot, drives: list[Drive]) -> float:
     """Position error [m] on healthy drives of a robot of the model fitted to some drives, as `sysid.fit` reads them;
     nan where these are refused."""
-    from sysid.logs.measured import load_any
+    from sysid.logs.loaders import load_any
     from sysid.logs.metrics import score
     from sysid.search.fitting import fit_log, predict
     from sysid.search.settings import FitConfig

@@ -46,7 +46,7 @@ from benchmarks.measured_verdicts import (
     one_loop,
     report,
 )  # fmt: skip
-from sysid.logs.measured import split
+from sysid.logs.loaders import split
 from sysid.logs.metrics import ideal_replay
 from sysid.logs.published.mrclam import load_mrclam
 from sysid.logs.records import Log

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sysid.logs.records import PoseStream, Prediction, Trial, command_in_force
-from sysid.logs.streams import added_up
+from sysid.logs.stream_quality import added_up
 
 DT = 0.05  # s
 BACK = 24  # steps of driving on as in the first instant, before the start: as late as a pose may be

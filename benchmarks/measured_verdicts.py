@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.fit_measured import thin
 from benchmarks.harness import figure
 from sysid.follow_up.unnamed import find_unnamed, replay_unnamed
-from sysid.logs.measured import split
+from sysid.logs.loaders import split
 from sysid.logs.metrics import ideal_replay, score
 from sysid.logs.published.drive_norlab import load_drive
 from sysid.logs.records import Log, Prediction, Trial

@@ -186,7 +186,7 @@ class Naive:
         """The seven numbers of a log: medians over its trials; nan where no trial shows one."""
         from sysid.logs.log import load_log
         from sysid.logs.records import command_in_force
-        from sysid.logs.streams import response_shift
+        from sysid.logs.stream_quality import response_shift
 
         rows = []
         for trial in load_log(log).training:

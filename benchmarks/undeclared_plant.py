@@ -30,10 +30,10 @@ from sysid.logs.log import load_log
 from sysid.pages.loop_report import effects as named_effects
 from sysid.pages.loop_report import make_report, write_run
 from sysid.pages.report import write_report
-from sysid.verdict.found import LARGEST
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.posterior import Thresholds, as_json, from_json, posterior
 from sysid.verdict.result import LoopConfig, Prepared, Result
+from sysid.verdict.search_record import LARGEST
 
 RECORDED = RESULTS / "undeclared.json"
 POWER = 0.84

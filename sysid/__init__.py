@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sysid.logs.loaders import load_any as load_any
     from sysid.logs.log import load_log as load_log
-    from sysid.logs.measured import load_any as load_any
     from sysid.logs.records import Command as Command
     from sysid.logs.records import Log as Log
     from sysid.logs.records import OdometryStream as OdometryStream
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _HOMES = {name: home for home, names in {
     "sysid.logs.log": ("Log", "Trial", "Command", "OdometryStream", "PoseStream", "load_log"),
-    "sysid.logs.measured": ("load_any",),
+    "sysid.logs.loaders": ("load_any",),
     "sysid.search.settings": ("FitConfig",),
     "sysid.search.fitting": ("fit_log", "predict"),
     "sysid.pages.fit_report": ("fit_dataset",),

@@ -91,7 +91,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
 
 def load(arguments: Arguments) -> tuple[Log, list[Log], Any]:
     """The drives, the reference drives and the vehicle, checked; ValueError or FileNotFoundError says what is wrong."""
-    from sysid.logs.measured import load_any
+    from sysid.logs.loaders import load_any
     from sysid.missing.fit_statistics import load_fitted
     from whill_mjx.vehicle.presets import preset_params
 

@@ -48,7 +48,7 @@ def main(config: ConvertConfig) -> Log:
 def to_lerobot(config: ConvertConfig) -> Log:
     """Write a dataset as a LeRobotDataset, whole or not at all."""
     from sysid.logs import lerobot
-    from sysid.logs.measured import load_whole
+    from sysid.logs.loaders import load_whole
 
     with refusing():
         log = load_whole(config.source, config.select)

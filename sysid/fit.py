@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from whill_mjx.io.command_line import listen, starts
 from whill_mjx.io.heartbeat import say_loading
@@ -20,8 +19,8 @@ if starts(__name__):
 
 from sysid import command_line
 from sysid.logs.coverage import doubts
+from sysid.logs.loaders import Form, load_any
 from sysid.logs.log import of_file
-from sysid.logs.measured import load_any
 from sysid.logs.records import Log
 from sysid.pages.fit_page import warning
 from sysid.pages.fit_report import Loaded, fit_dataset
@@ -44,7 +43,7 @@ class Arguments(command_line.OwnModels, FitConfig):
 
     out: Path = Path("runs/fit")
     """Folder for report.json, plots and vehicle.toml."""
-    format: Literal["auto", "dataset", "drive_norlab", "mrclam"] = "auto"
+    format: Form = "auto"
     """Form of the data; found out by default."""
     train: tuple[str, ...] = ()
     """Trials to fit in a measured set: RUN, GROUP or RUN:FROM-TO, e.g. warthog_asphalt_a:0-0.667 or robot1."""

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from whill_mjx.io.command_line import OptionError, listen, refusing, starts
 
@@ -24,7 +24,7 @@ import numpy as np
 from sysid import command_line
 from sysid.logs.coverage import Blind
 from sysid.logs.inspection import inspect, text
-from sysid.logs.measured import load_whole
+from sysid.logs.loaders import Form, load_whole
 from sysid.logs.next_drives import NextDrive, next_drives
 from sysid.logs.records import Log
 from whill_mjx.io.command_line import POSITIVE, Range
@@ -42,7 +42,7 @@ class InspectConfig:
     """Folder of a dataset, of DRIVE runs or of MRCLAM; or a robot file."""
     select: tuple[str, ...] = ()
     """Part of a measured set: RUN, GROUP or RUN:FROM-TO. By default all runs of one robot."""
-    format: Literal["auto", "dataset", "drive_norlab", "mrclam"] = "auto"
+    format: Form = "auto"
     """Form of the data; found out by default."""
     wheels: tuple[str, ...] = ()
     """Joints or actuators of the driven wheels of a robot file, left and right."""

@@ -20,7 +20,7 @@ if starts(__name__):
 import numpy as np
 
 from sysid import command_line
-from sysid.logs.measured import load_any
+from sysid.logs.loaders import load_any
 from sysid.logs.records import Log
 from sysid.pages.paper_page import HELD_OUT, PARAMETERS, PaperConfig, caution, compare, markdown, write
 from sysid.pages.report import code_hashes, error_rows

@@ -25,7 +25,7 @@ if starts(__name__):
 import jax
 
 from sysid import command_line
-from sysid.logs.measured import load_any
+from sysid.logs.loaders import load_any
 from sysid.logs.records import Log
 from sysid.pages.plots import write_search_plot
 from sysid.pages.report import code_hashes, write_report

@@ -20,8 +20,8 @@ from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.days import Wander
 from sysid.missing.evidence import Columns, Evidence, Solver
-from sysid.verdict.found import Scan, family, tails
 from sysid.verdict.scan import NullDays, worth_on
+from sysid.verdict.search_record import Scan, family, tails
 
 DRAWS = 200
 SEED = 3  # beside that of the scan's nulls

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.logs.records import Log, Trial, with_timeout
-from sysid.logs.streams import GRID_DT, speeds
+from sysid.logs.stream_quality import GRID_DT, speeds
 
 QUIET, PAUSE = 2.5, 1.0  # usual intervals between commands, and s, beyond whichever is shorter they pause
 ASKED = (0.05, 0.1)  # m/s and rad/s of a command in force that shows whether the vehicle follows it

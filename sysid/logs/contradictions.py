@@ -31,7 +31,7 @@ from sysid.logs.directions import (
 )
 from sysid.logs.planar import differenced, half_span
 from sysid.logs.records import Trial, logged_pose
-from sysid.logs.streams import SMOOTHING, speeds
+from sysid.logs.stream_quality import SMOOTHING, speeds
 
 LITTLE = 0.75  # share of the motion that a direction must explain, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named

@@ -17,8 +17,8 @@ from sysid.logs.bags.recording import OPTIONS, PACKED, find_bags
 from sysid.logs.coverage import sanity
 from sysid.logs.dataset_writing import HEADERS, Found, copies, write_dataset
 from sysid.logs.drive_cuts import SHORTEST, ConvertConfig, Drive, Source, at_axle, cut_drives, trial_drive
+from sysid.logs.loaders import detect_format, is_known, load_whole
 from sysid.logs.log import load_log, read_csv, read_fields, spec_from_fields
-from sysid.logs.measured import detect_format, is_known, load_whole
 from sysid.logs.records import Log, name_of, spaced
 from sysid.logs.sources import is_lerobot
 from sysid.logs.tables.drives import TextDrive, join_drives, read_drives

@@ -12,7 +12,7 @@ from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.directions import ALIKE, UNLIKE
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
 from sysid.logs.records import CHECK, Command, Log, Trial, logged_pose
-from sysid.logs.streams import Shift, response_shift, speeds, standstill
+from sysid.logs.stream_quality import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import forward_jump, pauses, set_forward, time_faults, uncommanded
 from sysid.logs.unusable import LOST, lost, said, stood
 from sysid.logs.wheel_faults import backward_wheel, wrong_sizes

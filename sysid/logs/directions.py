@@ -13,7 +13,7 @@ import numpy as np
 
 from sysid.logs.planar import differenced, half_span, turned_by
 from sysid.logs.records import Trial, logged_pose
-from sysid.logs.streams import GRID_DT
+from sysid.logs.stream_quality import GRID_DT
 
 RESPONSE = 0.3  # s that a vehicle takes to follow its command, where nothing else is known
 NONE = 0.02  # m/s, below which a speed is none

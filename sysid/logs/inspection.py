@@ -10,7 +10,7 @@ import numpy as np
 
 from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity
 from sysid.logs.records import Log
-from sysid.logs.streams import Shift, StreamQuality, clock_shift, pose_jitter, response_shift, trial_quality
+from sysid.logs.stream_quality import Shift, StreamQuality, clock_shift, pose_jitter, response_shift, trial_quality
 
 MAX_ROWS = 40  # trials listed one by one; more are summed up by group
 POSE_JITTER = 0.003  # s, more than rounding and noise of the speeds explain

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from sysid.logs.records import Trial
-from sysid.logs.streams import added_up
+from sysid.logs.stream_quality import added_up
 
 GRID = np.linspace(0.0, 1.0, 41)  # s
 FLIPS = 20000

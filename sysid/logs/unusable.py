@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.logs.records import Log, Trial, logged_pose
-from sysid.logs.streams import added_up, speeds
+from sysid.logs.stream_quality import added_up, speeds
 
 LOST = 0.5  # yaw [rad] by which the outside pose may part from the rate: at 3 m/s it is off by 1.5 m a second later
 LATEST, STEP = 1.2, 0.05  # s, delays of the outside pose that are tried

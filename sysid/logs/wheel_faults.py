@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.logs.directions import ALIKE, APART, RESPONSE, SURE, UNLIKE, VARIED, WHOLE, direction, likeness, motion_of
 from sysid.logs.records import Log, Trial
-from sysid.logs.streams import GRID_DT, clock_shift, speeds
+from sysid.logs.stream_quality import GRID_DT, clock_shift, speeds
 from whill_mjx.vehicle.specs import VehicleSpec
 
 STILL = 1e-3  # standard deviation of a speed that hardly changes

@@ -15,7 +15,7 @@ from sysid.errors.prior import moved
 from sysid.intervals import uncertainty
 from sysid.intervals.uncertainty import Estimate
 from sysid.logs import odometry_frames
-from sysid.logs.measured import load_any
+from sysid.logs.loaders import load_any
 from sysid.logs.metrics import score
 from sysid.logs.records import Log, Prediction, Trial
 from sysid.missing.fit_statistics import statistics_of

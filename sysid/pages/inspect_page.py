@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid.logs.records import Log
-from sysid.logs.streams import speeds
+from sysid.logs.stream_quality import speeds
 from sysid.pages.plots import pyplot, save
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.html import Cell, Section, bullets, html_page, paragraph, png, table

@@ -17,9 +17,9 @@ from sysid.missing.signatures import group_names
 from sysid.replay.rollout import predictions
 from sysid.verdict.falsifiers import as_report as predictions_of
 from sysid.verdict.forms import forms_of
-from sysid.verdict.found import ROUNDS
 from sysid.verdict.result import Result, Support
 from sysid.verdict.scan import null_days
+from sysid.verdict.search_record import ROUNDS
 from sysid.verdict.vehicles import drives_of, fitted_after, fitted_before, refitter_of
 from whill_mjx.effects import about_of
 from whill_mjx.vehicle.parameters import describe, get_values

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sysid.errors.pose_objective import Noise
-from sysid.logs.measured import load_any
+from sysid.logs.loaders import load_any
 from sysid.logs.metrics import METRICS, UNITS, ideal_replay, own_floor, score
 from sysid.logs.records import Prediction, Trial
 from sysid.pages.fit_page import REPLAYS, fit_sections, headline

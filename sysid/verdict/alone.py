@@ -21,9 +21,9 @@ from dataclasses import replace
 from sysid.errors.noise import repeated
 from sysid.logs.records import Trial
 from sysid.verdict.agreement import interval_of_sum
-from sysid.verdict.found import LARGEST, ROUNDS, PairScan, Search
 from sysid.verdict.posterior import NOTHING
 from sysid.verdict.rounds import Asked, candidates_of, class_of, held_back
+from sysid.verdict.search_record import LARGEST, ROUNDS, PairScan, Search
 from whill_mjx.effects import card_of
 
 SURE = 1e-10

@@ -21,8 +21,8 @@ from sysid.logs.records import Log
 from sysid.missing.catalogue import PARAMETER
 from sysid.missing.evidence import with_values
 from sysid.missing.pose_fit import fit_poses
-from sysid.verdict.found import Candidate
 from sysid.verdict.result import Result
+from sysid.verdict.search_record import Candidate
 from sysid.verdict.vehicles import drives_of, fitted_before
 from whill_mjx.vehicle.parameters import set_values
 

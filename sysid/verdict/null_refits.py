@@ -20,10 +20,10 @@ from sysid.missing.refit import ITERATIONS, Refitter, side_by_side
 from sysid.missing.signatures import white_leftover
 from sysid.replay.cores import on_processor
 from sysid.search.result import Progress
-from sysid.verdict.found import NullRefits, PairScan, Search, tails
 from sysid.verdict.posterior import Thresholds, posterior
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import best, drawn_away, scan_again
+from sysid.verdict.search_record import NullRefits, PairScan, Search, tails
 
 TOGETHER, ACCELERATED = 16, 100  # days whose base fits advance side by side on a processor, and on an accelerator
 

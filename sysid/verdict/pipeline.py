@@ -25,7 +25,6 @@ from sysid.missing.unexplained import best_gain
 from sysid.search.result import Progress
 from sysid.verdict.alone import search_alone, stands_alone
 from sysid.verdict.falsification import put_to_test
-from sysid.verdict.found import PairScan, Search
 from sysid.verdict.late_pose import told_late
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
@@ -34,6 +33,7 @@ from sysid.verdict.preparation import as_shown, days_of, expected_steps, prepare
 from sysid.verdict.result import LoopConfig, Prepared, Result, Support
 from sysid.verdict.rounds import Asked, begin
 from sysid.verdict.search import pairs_of, settle
+from sysid.verdict.search_record import PairScan, Search
 from sysid.verdict.surroundings import floor_change, noise_change, with_noise
 
 

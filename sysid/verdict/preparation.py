@@ -23,8 +23,8 @@ from sysid.replay.models import gyro_effects, with_effects
 from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay, vehicle_plant
 from sysid.search.result import Progress
-from sysid.verdict.found import ROUNDS
 from sysid.verdict.result import LoopConfig, Prepared
+from sysid.verdict.search_record import ROUNDS
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.parameters import describe, get_values, set_values
 from whill_mjx.vehicle.presets import preset_params

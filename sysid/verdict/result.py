@@ -21,8 +21,8 @@ from sysid.replay.records import FreeVehicle, Plant
 from sysid.replay.rollout import PathReplay
 from sysid.verdict.agreement import Heterogeneity, foretold, heterogeneity, interval_of_sum, sizes_apart
 from sysid.verdict.falsifiers import Tested, in_words
-from sysid.verdict.found import NullRefits, Search
 from sysid.verdict.posterior import Thresholds
+from sysid.verdict.search_record import NullRefits, Search
 from whill_mjx.io.command_line import PHYSICS_DT, SEED, Range
 
 

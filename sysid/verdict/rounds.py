@@ -15,10 +15,10 @@ from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.missing.refit import Refitter
 from sysid.search.result import Progress
 from sysid.verdict.agreement import beside, foretold
-from sysid.verdict.found import CANDIDATES, WEIGHED, Candidate, PairScan, Scan, Search
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import LoopConfig, Prepared
 from sysid.verdict.scan import best, imitation, run
+from sysid.verdict.search_record import CANDIDATES, WEIGHED, Candidate, PairScan, Scan, Search
 
 FIRST_LOOK, POLISH, TO_ITS_END = 4, 8, 60
 """Iterations at most of a refit for every candidate, of one that starts again, and of what is compared or built on: cut

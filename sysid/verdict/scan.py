@@ -16,7 +16,7 @@ import numpy as np
 from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.days import Wander
 from sysid.missing.evidence import Columns, Evidence, Solver
-from sysid.verdict.found import PairScan, Scan, tails
+from sysid.verdict.search_record import PairScan, Scan, tails
 
 REACH = 1.6  # how far beyond a level its columns are trusted, as a factor on the level
 SPREAD_FREEDOM = 8  # degrees of freedom that the day-to-day spread rests on

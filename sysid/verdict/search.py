@@ -10,7 +10,6 @@ import numpy as np
 from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.verdict.agreement import errors_of_sizes, half_width
 from sysid.verdict.forms import forms_of
-from sysid.verdict.found import LARGEST, ROUNDS, WEIGHED, Candidate, PairScan, Search
 from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
 from sysid.verdict.rounds import (
     POLISH,
@@ -24,6 +23,7 @@ from sysid.verdict.rounds import (
     pair_round,
 )  # fmt: skip
 from sysid.verdict.scan import DRAWS, null_days, scan_pairs
+from sysid.verdict.search_record import LARGEST, ROUNDS, WEIGHED, Candidate, PairScan, Search
 
 
 @dataclass(frozen=True)

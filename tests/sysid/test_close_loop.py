@@ -28,7 +28,6 @@ from sysid.replay.models import with_effects
 from sysid.replay.records import Measured
 from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.falsification import course_of, put_to_test
-from sysid.verdict.found import NullRefits
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
 from sysid.verdict.pipeline import check_logs, find_missing
@@ -37,6 +36,7 @@ from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import Asked
 from sysid.verdict.search import settle
+from sysid.verdict.search_record import NullRefits
 from sysid.verdict.vehicles import (
     drives_of,
     fitted_alone,

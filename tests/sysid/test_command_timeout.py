@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sysid.logs.command_timeout import command_timeout, with_own_timeout
+from sysid.logs.loaders import load_any
 from sysid.logs.log import load_log, make_trial
-from sysid.logs.measured import load_any
 from sysid.logs.records import Command, OdometryStream, with_timeout
 from whill_mjx.logs.dataset import COMMAND_HEADER, ODOMETRY_HEADER, write_csv, write_text
 

@@ -20,8 +20,8 @@ import sysid.convert as convert_module
 from sysid.logs.bags.messages import CHAIR_DEFINITION, JOYSTICK_FIELDS
 from sysid.logs.bags.recording import CHAIR_STATE
 from sysid.logs.conversion import ConvertConfig, convert
+from sysid.logs.loaders import load_any, load_whole
 from sysid.logs.log import load_log, make_trial
-from sysid.logs.measured import load_any, load_whole
 from sysid.logs.planar import yaw_of
 from sysid.logs.published.drive_norlab import load_drive
 from sysid.logs.records import Command, OdometryStream, PoseStream

@@ -21,13 +21,13 @@ from sysid.inspect import InspectConfig, main
 from sysid.logs import replicates
 from sysid.logs.coverage import blind_spots, excitation, replicate_spread, sanity, sign_changes
 from sysid.logs.inspection import inspect, text
+from sysid.logs.loaders import load_whole
 from sysid.logs.log import load_log
-from sysid.logs.measured import load_whole
 from sysid.logs.metrics import ideal_replay
 from sysid.logs.next_drives import next_drives
 from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import Command, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of, with_timeout
-from sysid.logs.streams import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
+from sysid.logs.stream_quality import LAGS, clock_shift, find_shift, pose_jitter, quality, response_shift, standstill
 from sysid.search import thin
 from sysid.verdict.pipeline import check_logs
 from whill_mjx.logs.dataset import COMMAND_HEADER, write_csv

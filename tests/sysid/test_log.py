@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from sysid.logs.loaders import load_any
 from sysid.logs.log import load_log, load_trial
-from sysid.logs.measured import load_any
 from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import FAR, manoeuvre_of
-from sysid.logs.streams import trial_quality
+from sysid.logs.stream_quality import trial_quality
 from whill_mjx.logs.dataset import write_csv, write_text
 from whill_mjx.vehicle.model import box_inertia
 from whill_mjx.vehicle.specs import HUSKY, WHILL_CR

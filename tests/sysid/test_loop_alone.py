@@ -21,11 +21,11 @@ from sysid.replay.one_drive import Commanded, path_of
 from sysid.replay.rollout import make_batch
 from sysid.verdict import alone, rounds
 from sysid.verdict.alone import UNTOLD, search_alone, stands_alone
-from sysid.verdict.found import Candidate
 from sysid.verdict.posterior import NOTHING, Thresholds
 from sysid.verdict.preparation import days_of
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import Asked, _nearly_best, begin, nearer, refitted
+from sysid.verdict.search_record import Candidate
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.specs import HUSKY
 

@@ -13,10 +13,10 @@ from sysid.verdict import falsification
 from sysid.verdict.agreement import SCATTER, heterogeneity, interval_of_sum
 from sysid.verdict.falsification import course_of, sizes_in_parts
 from sysid.verdict.falsifiers import QUIET, SPLITS, side
-from sysid.verdict.found import Candidate, Search
 from sysid.verdict.pipeline import guarded
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import Support
+from sysid.verdict.search_record import Candidate, Search
 from whill_mjx.effects import EFFECTS
 from whill_mjx.effects.card import GONE_WHEN_SETTLED, QUANTITIES, STATES, Axis, Falsifier
 from whill_mjx.vehicle.presets import preset

@@ -15,8 +15,8 @@ from sysid.missing.catalogue import Axis, Hypothesis
 from sysid.missing.evidence import Columns
 from sysid.missing.joint_fit import Refit
 from sysid.verdict import late_pose
-from sysid.verdict.found import Search
 from sysid.verdict.result import LoopConfig
+from sysid.verdict.search_record import Search
 
 pytestmark = pytest.mark.quick
 BLOCKS = [list(range(4 * b, 4 * b + 4)) for b in range(8)]

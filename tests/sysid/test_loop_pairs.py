@@ -14,13 +14,13 @@ from sysid.missing.evidence import Solver, column_layout
 from sysid.missing.joint_fit import Refit, moved_last
 from sysid.pages.loop_tables import detectable
 from sysid.verdict import rounds
-from sysid.verdict.found import tail
 from sysid.verdict.posterior import Thresholds
 from sysid.verdict.result import LoopConfig
 from sysid.verdict.rounds import begin
 from sysid.verdict.scan import CHI_SQUARED, best, null_days, run, scan_again, scan_pairs
 from sysid.verdict.search import pairs_of as pairs_of_effects
 from sysid.verdict.search import settle
+from sysid.verdict.search_record import tail
 
 pytestmark = pytest.mark.quick
 def pairs_of(evidence, wander, similar=np.eye(4), draws=200):  # noqa: B008

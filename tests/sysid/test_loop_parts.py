@@ -28,11 +28,11 @@ from sysid.pages.verdict_picture import account, draw
 from sysid.verdict import null_refits, rounds
 from sysid.verdict import search as search_module
 from sysid.verdict.agreement import foretold
-from sysid.verdict.found import Scan
 from sysid.verdict.posterior import Findings, Left, Thresholds, TriedSet, as_json, from_json, posterior, read, write
 from sysid.verdict.preparation import as_shown
 from sysid.verdict.rounds import Asked
 from sysid.verdict.scan import imitation
+from sysid.verdict.search_record import Scan
 from whill_mjx.effects import about_of
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.parameters import set_values

@@ -10,7 +10,7 @@ import pytest
 from conftest import shared_folder
 
 from sysid.close_loop import Arguments, load
-from sysid.logs.measured import detect_format, load_any, split
+from sysid.logs.loaders import detect_format, load_any, split
 from sysid.logs.published.drive_norlab import CONTINUOUS_COLUMNS, load_drive
 from sysid.logs.published.mrclam import load_mrclam
 from sysid.logs.published.poses import only_changes

@@ -11,12 +11,12 @@ import pytest
 
 from sysid.logs.contradictions import running_fast
 from sysid.logs.coverage import doubts, sanity
+from sysid.logs.loaders import load_any
 from sysid.logs.log import load_log
-from sysid.logs.measured import load_any
 from sysid.logs.metrics import CHANNELS
 from sysid.logs.planar import integrate_speeds
 from sysid.logs.records import FAR, Command, GyroStream, Log, OdometryStream, PoseStream, Start, Trial, manoeuvre_of
-from sysid.logs.streams import clock_shift, response_shift
+from sysid.logs.stream_quality import clock_shift, response_shift
 from sysid.logs.unusable import stood, without_standing
 from sysid.logs.wheel_faults import backward_wheel
 from sysid.logs.windows import WINDOW, in_windows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sysid.logs.command_timeout import with_own_timeout
 from sysid.logs.log import load_log
@@ -12,9 +12,12 @@ from sysid.logs.published.drive_norlab import load_drive, most_runs
 from sysid.logs.published.mrclam import ROBOTS, load_mrclam, mrclam_files, mrclam_robots
 from sysid.logs.records import Log
 from sysid.logs.sources import about
-from sysid.logs.streams import without_held
+from sysid.logs.stream_quality import without_held
 from sysid.logs.unusable import without_lost, without_standing
 from sysid.logs.windows import in_windows
+
+Form = Literal["auto", "dataset", "drive_norlab", "mrclam"]
+"""Forms of data that `load_any` reads."""
 
 
 def detect_format(path: str | Path) -> str:
@@ -82,8 +85,8 @@ def load_any(path: str | Path, form: str = "auto", train: tuple[str, ...] = (), 
     """Load a folder in any known format; `train` and `held_out` select among the measured sets' trials.
 
     Training trials of DRIVE whose outside pose was lost are left out (`sysid.logs.unusable`), and so are a
-    dataset's rows that were held between updates (`sysid.logs.streams.without_held`). A base that stops by itself where
-    no command comes does so in replays too (`sysid.logs.command_timeout`). A note says each.
+    dataset's rows that were held between updates (`without_held`). A base that stops by itself where no command comes
+    does so in replays too (`sysid.logs.command_timeout`). A note says each.
     """
     form = detect_format(path) if form == "auto" else form
     if form == "dataset" and held_out and not train:
