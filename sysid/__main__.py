@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+from whill_mjx.io.command_line import guarded
+
 COMMANDS = ("inspect", "convert", "fit", "close_loop", "design", "paper", "searches", "report", "verdict")
 
 
@@ -24,4 +26,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()

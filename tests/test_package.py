@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import configparser
+import os
 import re
 import runpy
 import signal
@@ -17,7 +18,7 @@ import pytest
 import yaml
 
 import whill_mjx
-from whill_mjx.io.command_line import starts
+from whill_mjx.io.command_line import UNREAD, starts
 
 pytestmark = pytest.mark.quick
 ROOT = Path(__file__).parent.parent
@@ -50,6 +51,15 @@ def test_each_console_script_listens_for_signals_before_its_slow_imports(name, m
         monkeypatch.setattr(sys, "argv", argv)
         assert starts(module) == expected
     assert starts("__main__")
+
+
+@pytest.mark.parametrize("package", ["whill_mjx", "sysid", "dreamer", "bridge"])
+def test_a_list_of_commands_that_nobody_reads_to_its_end_is_no_error(package):
+    read, written = os.pipe()
+    os.close(read)
+    child = subprocess.run([sys.executable, "-m", package], cwd=ROOT, stdout=written, stderr=subprocess.PIPE, text=True)
+    os.close(written)
+    assert (child.returncode, child.stderr) == (UNREAD, "")
 
 
 def test_a_signal_ends_a_console_script_that_still_imports(tmp_path):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+from whill_mjx.io.command_line import guarded
+
 COMMANDS = ("train", "evaluate", "drive", "look", "view", "maps", "export_mjcf", "export_python")
 
 
@@ -22,4 +24,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with guarded():
+        main()
