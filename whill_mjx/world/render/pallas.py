@@ -20,6 +20,7 @@ from flax import struct
 from whill_mjx.world.render import culling, visibility
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
+from whill_mjx.world.render.rectangles import CHUNK, Kind, Listed, Numbers, listed
 from whill_mjx.world.render.rich import CASTER, NUMBERS, caster_factor, caster_reach
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
 from whill_mjx.world.render.tables import lit_words, make_tables, parts_of
@@ -27,8 +28,6 @@ from whill_mjx.world.render.textures import whole
 from whill_mjx.world.render.visibility import FAR, MARKER, Rays, key_of
 from whill_mjx.world.scene import Scene
 
-CHUNK = 32
-"""Rectangles compared at once: the bits of an integer."""
 FOUR = 4
 """Numbers that a thread loads at once: 16 bytes."""
 
@@ -65,17 +64,6 @@ class Tiling:
 
 
 @struct.dataclass
-class Listed:
-    """Primitives of one kind: their numbers, and the rectangles that the tiles are compared with."""
-
-    table: Any  # (P, n)
-    bounds: Any  # (5, P padded to CHUNK): low u, high u, low v, high v, near
-    order: Any  # (P padded,) int32 place in the table, front to back; None: as they are
-    shadow: Any  # (P, m) numbers of the shadow test, or None
-    shadow_bounds: Any  # (5, P padded) or None
-
-
-@struct.dataclass
 class Inputs:
     """Everything that the kernel reads."""
 
@@ -88,31 +76,6 @@ class Inputs:
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
     materials: Any = None  # of NUMBERS; None without rich looks
-
-
-class Kind(NamedTuple):
-    """Solids of one kind: what the kernel reads of each, whether it is there, and of its shadow."""
-
-    table: Any  # (N, numbers)
-    mask: jax.Array
-    body: culling.Body
-    shadow: jax.Array | None
-
-
-@dataclass(frozen=True, eq=False)
-class Numbers:
-    """An array of numbers in memory; each is loaded where it is asked for, so that none waits in a register."""
-
-    memory: Any
-    places: np.ndarray
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.places.shape
-
-    def __getitem__(self, index: Any) -> Any:
-        places = self.places[index]
-        return Numbers(self.memory, places) if np.ndim(places) else self.memory[int(places)]
 
 
 class Tile(NamedTuple):
@@ -227,7 +190,7 @@ def _inputs(
     if rounds is not None:
         kinds["round"] = Kind(tables.round, rounds.mask, culling.round_body(rounds), tables.round_shadow)
     eye = culling.Eye(view.position, view.rotation, scene.looks.sun)
-    listed = {name: _listed(eye, kind, tiling) for name, kind in kinds.items()}
+    lists = {name: listed(eye, kind, tiling.sort, tiling.interpret) for name, kind in kinds.items()}
 
     seed = view.looks.seed.astype(jnp.uint32)
     integers = jnp.stack([jax.lax.bitcast_convert_type(seed, jnp.int32), finite.astype(jnp.int32)])
@@ -253,62 +216,7 @@ def _inputs(
     rows = None if lit_words(scene) else _flat(tables.rows)
     bent, materials = _flat(tables.bent), _flat(tables.materials)
     floats, words = jnp.concatenate(flat), tables.words.reshape(-1)
-    return Inputs(floats, integers, words, dark, rows, bent, atlas, listed, materials), rebuild
-
-
-def _listed(eye: culling.Eye, kind: Kind, tiling: Tiling) -> Listed:
-    """Rectangles of one kind, padded to whole chunks; with `sort` in front-to-back order where there are several."""
-    count = kind.table.shape[0]
-    sides, order = _rectangles(eye._replace(sun=None), kind, tiling.interpret), None
-    if tiling.sort and count > CHUNK:
-        order = jnp.argsort(sides[4]).astype(jnp.int32)  # the padding is at depth NOTHING
-        sides = sides[:, order]
-        order = jnp.minimum(order, count - 1)
-    shadows = None if kind.shadow is None else _rectangles(eye, kind, tiling.interpret)
-    return Listed(kind.table, sides, order, kind.shadow, shadows)
-
-
-def _rectangles(eye: culling.Eye, kind: Kind, interpret: bool) -> jax.Array:
-    """(5, P padded) `culling.bounds` of one kind, by a kernel that takes a primitive per thread.
-
-    XLA would compute all corners anew for each of the five results, or write them to memory.
-    """
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton as plt
-
-    body, extra = kind.body, -kind.mask.shape[0] % CHUNK
-    lines = [*body.centre, *body.ways[0], *body.ways[1], *body.ways[2], kind.mask.astype(jnp.float32)]
-    table = jnp.pad(jnp.stack(lines), ((0, 0), (0, extra)))
-    given = [eye.position, eye.rotation.reshape(-1), *([] if eye.sun is None else [eye.sun])]
-    count = culling.corner_count(eye)
-
-    def kernel(table, pose, out):
-        lanes = pl.ds(pl.program_id(0) * CHUNK, CHUNK)
-        line = [table[i, lanes] for i in range(len(lines))]
-        numbers = Numbers(pose, np.arange(12 if count == 8 else 15))
-        sun = None if count == 8 else numbers[12:]
-        own = culling.Eye(numbers[:3], Numbers(pose, np.arange(3, 12).reshape(3, 3)), sun)
-        bodies = culling.Body(tuple(line[:3]), (tuple(line[3:6]), tuple(line[6:9]), tuple(line[9:12])))  # type: ignore
-
-        def one(number, widest):
-            signs = [sign.astype(jnp.float32) for sign in culling.corner_signs(number, count)]
-            new = culling.corner_sides(own, bodies, signs)
-            pairs = zip(culling.WIDER, widest, new, strict=True)
-            return culling.Sides(*(pick(old, other) for pick, old, other in pairs))
-
-        nothing = culling.Sides(*(jnp.full((CHUNK,), one, jnp.float32) for one in culling.NO_SIDES))
-        sides = jax.lax.fori_loop(0, count, one, nothing)
-        for i, leaf in enumerate(jax.tree.leaves(culling.shown_bounds(sides, line[12] > 0.0))):
-            out[i, lanes] = leaf
-
-    return pl.pallas_call(
-        kernel,
-        out_shape=jax.ShapeDtypeStruct((5, table.shape[1]), jnp.float32),
-        grid=(table.shape[1] // CHUNK,),
-        compiler_params=plt.CompilerParams(num_warps=1, num_stages=1),
-        interpret=interpret,
-        name="rectangles",
-    )(table, jnp.concatenate(given))
+    return Inputs(floats, integers, words, dark, rows, bent, atlas, lists, materials), rebuild
 
 
 def _first_labels(scene: Scene) -> dict[str, int]:
