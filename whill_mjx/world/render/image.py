@@ -8,7 +8,6 @@ images are drawn in blocks (`blocks`), and the tables are complete before the fi
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ from whill_mjx.world.render import visibility
 from whill_mjx.world.render.blocks import in_blocks
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.render.culling import strip_lists, upright_bounds
-from whill_mjx.world.render.rich import shadow_factor
+from whill_mjx.world.render.rich import Everywhere
 from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
 from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal, larger, smaller
@@ -152,7 +151,7 @@ def _stage(view: View, scene: Scene, quality: Quality, rows: bool = False) -> Ar
 
 
 @struct.dataclass
-class Arrays:
+class Arrays(Everywhere):
     """The stage of the jnp renderer: tables are arrays, and every pixel meets every primitive of its strip."""
 
     parts: Parts
@@ -242,12 +241,6 @@ class Arrays:
         if tables.round_shadow is not None:
             dark = dark | _any_shadow(visibility.round_shadow, tables.round_shadow, x, y, z)
         return dark
-
-    def soft_shadow(self, casters, x, y, z) -> jax.Array:
-        return shadow_factor(casters, x, y, z)
-
-    def where_some(self, condition, compute: Callable, otherwise) -> Any:
-        return compute()  # all pixels are drawn together
 
     def _picture(self, number, s, t) -> list:
         count, size, _ = self.atlas.shape  # type: ignore[union-attr]

@@ -106,8 +106,8 @@ def _paint(stage: Any, surface: Surface, seed: jax.Array) -> tuple[list, jax.Arr
     return paint, jnp.maximum(jnp.where(banded, 1.0 + 0.5 * m[17] * blotch, tone * (1.0 - joint)), 0.0)
 
 
-class _Everywhere:
-    """A `Stage` as far as light asks it, which skips nothing."""
+class Everywhere:
+    """The part of a `Stage` that may skip work, skipping nothing: all points are drawn together."""
 
     @staticmethod
     def where_some(condition, compute: Callable, otherwise) -> Any:
@@ -118,7 +118,7 @@ class _Everywhere:
         return shadow_factor(casters, x, y, z)
 
 
-def _light(lights, normal, point, stage: Any = _Everywhere) -> list:
+def _light(lights, normal, point, stage: Any = Everywhere) -> list:
     """Light on a surface, for each channel: ambient, lamps, soft shadows near the floor, and a patch of sunlight."""
     x, y, z = point
     sky = 0.8 + 0.2 * normal[2]
