@@ -19,7 +19,7 @@ from sysid.logs.replicates import same_course
 from sysid.replay.arrays import Quotients, moved
 from sysid.replay.cores import on_all_cores
 from sysid.replay.records import ODOMETRY, POSE, TURN, Batch, FreeVehicle, Measured, Simulated
-from sysid.replay.rollout import PathReplay, make_batch
+from sysid.replay.rollout import PathReplay, make_batch, records_of
 from whill_mjx.effects.supply_sag import ROUND
 from whill_mjx.vehicle.parameters import get_values, set_values
 from whill_mjx.vehicle.types import parameters_of
@@ -85,6 +85,14 @@ class Drives:
         """(B,) time of the session at which each trial began [s], nan where nothing says it."""
         return session_times(self.trials)
 
+    @cached_property
+    def _records(self) -> np.ndarray:
+        """(B,) records that a replay of each trial needs: what its course is read for."""
+        own = records_of(self.trials, self.vehicle.plant.dt * self.batch.command.shape[2])
+        most = np.zeros(len(self.courses.first), int)
+        np.maximum.at(most, self.courses.of_trial, own)
+        return np.asarray(most[self.courses.of_trial])
+
     def weighted(self, simulated: np.ndarray, factors: np.ndarray, track: float) -> Drives:
         """The same drives with rough bins, as `simulated` (B, K, 5) shows them, weighted by noise `factors` (4, 5)."""
         level = roughness(simulated, self.features.width, track)
@@ -120,7 +128,7 @@ class Drives:
         rows = [self.courses.first if shared else every for shared in once]
         sets = np.repeat(np.arange(len(values)), [len(each) for each in rows])
         drives = np.concatenate(rows)
-        paths = self.paths(self._in_session(values[sets], drives), self.batch, drives)
+        paths = self.paths(self._in_session(values[sets], drives), self.batch, drives, self._records)
         parts = np.split(paths, np.cumsum([len(each) for each in rows])[:-1])
         return [(part, self.courses.of_trial if shared else every) for part, shared in zip(parts, once, strict=True)]
 

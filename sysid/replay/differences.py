@@ -30,7 +30,7 @@ from sysid.replay.cores import on_all_cores, on_processor
 from sysid.replay.models import Parameters, set_parameters
 from sysid.replay.on_host import HostReplay
 from sysid.replay.records import ODOMETRY, POSE, TURN, Measured, Plant, Simulated
-from sysid.replay.rollout import PathReplay, Replay, make_batch, sent
+from sysid.replay.rollout import PathReplay, Replay, make_batch, records_of, sent
 
 AROUND = 0.1  # s, over which the speeds at the begin of a piece are averaged
 
@@ -50,6 +50,8 @@ class CourseReplay:
         self._course = np.array([seen.setdefault(key, len(seen)) for key in keys])  # (B,)
         first = np.array([keys.index(key) for key in seen])
         self.courses = len(first)
+        own = records_of(trials, self._record)
+        self._records = np.array([own[self._course == course].max() for course in range(self.courses)])
         # Poses are moved from the start of the course to that of the trial.
         from_start = start[first] * ([0, 0, 0, 1, 1] if anywhere else [1, 1, 1, 1, 1])
         self._from, self._to = from_start[self._course, :3], start[:, :3]
@@ -92,7 +94,8 @@ class CourseReplay:
             size = max(len(values), 2 * values.shape[1] + 1)  # a single one and a Jacobian's are compiled together
             return self._spread(self._replay.simulate(values, size))
         sets, courses = len(values), self.courses
-        paths = self.paths(np.repeat(values, courses, axis=0), self._replay.batch, np.tile(np.arange(courses), sets))
+        paths = self.paths(np.repeat(values, courses, axis=0), self._replay.batch, np.tile(np.arange(courses), sets),
+                           self._records)
         paths = paths.reshape(sets, courses, *paths.shape[1:])
         turned = paths[..., TURN] if self._replay.batch.gyro_index is not None else None
         path = Simulated(paths[..., POSE], paths[..., ODOMETRY], paths[:, :, -1, 8], turned)  # type: ignore[arg-type]

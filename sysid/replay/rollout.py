@@ -42,6 +42,7 @@ ROWS = 96
 long and 160 nearly as long, but searches often try four parameter sets at once, on eight courses."""
 ACCELERATED = 8192  # the same on an accelerator, which takes nearly as long for one
 FETCHED = 512  # rows by which what an accelerator sends back grows: each size is compiled once
+BEYOND = 0.5  # s that a drive is replayed beyond its last measurement, of which late time stamps show a part
 ROOMS = (512, 1024, 2048, 4096)
 """Records for which one program has room, up to 41 s; longer drives have programs for multiples of the last."""
 
@@ -93,7 +94,7 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
         raise ValueError("no trials to simulate. Check the selections of training and held-out trials.")
     stride = max(round(record_dt / dt), 1)
     record = stride * dt
-    records = max(math.ceil(trial.duration / record - 1e-6) for trial in trials) + 1
+    records = int(records_of(trials, record).max())
     middles = (np.arange(records * stride) + 0.5) * dt  # of the physics steps, in which what is in force then acts
     command = np.stack([trial.commanded(middles).T for trial in trials])
     start = np.array([[t.start.x, t.start.y, t.start.yaw, t.start.v, t.start.omega] for t in trials])
@@ -110,6 +111,11 @@ def make_batch(trials: tuple[Trial, ...], dt: float, record_dt: float = RECORD_D
     gyro_index, gyro_weight = _grid(gyro_t, record, records)
     batch = replace(batch, gyro_index=sent(gyro_index), gyro_weight=sent(gyro_weight))
     return batch, Measured(pose, pose_mask, odometry, odometry_mask, gyro, gyro_mask, gyro_t)
+
+
+def records_of(trials: Sequence[Trial], record: float) -> np.ndarray:
+    """(B,) how many records, `record` seconds apart, each trial lasts."""
+    return np.array([math.ceil(trial.duration / record - 1e-6) + 1 for trial in trials])
 
 
 def sent(array: np.ndarray) -> jax.Array:
@@ -231,7 +237,8 @@ class _Programs:
             def steps(state: Any, path: jax.Array, count: jax.Array) -> jax.Array:
                 return jax.lax.fori_loop(0, count, after, (state, path))[1]
 
-            return in_one(steps)(state, path, count)
+            path = in_one(steps)(state, path, count)
+            return jnp.where(jnp.arange(len(path))[:, None] > count, path[count], path)  # it stays where it ended
 
         def finish(values: jax.Array, path: jax.Array, command: jax.Array, start: jax.Array, gyro: bool) -> jax.Array:
             params = set_values(values)
@@ -252,10 +259,13 @@ class _Programs:
         self._finish.compile(values, path, command, start, gyro)
         self._begin.compile(values, command, start, warm_up)
 
-    def __call__(self, values: np.ndarray, command: np.ndarray, start: np.ndarray, warm_up: int, gyro: bool) -> Any:
-        """Paths (N, R + 1, C) of sets (N, P) and drives with commands (N, R, K, 2) from starts (N, 5)."""
+    def __call__(
+        self, values: np.ndarray, command: np.ndarray, start: np.ndarray, warm_up: int, gyro: bool, records: int
+    ) -> Any:
+        """Paths (N, R + 1, C) of sets (N, P) and drives with commands (N, R, K, 2) from starts (N, 5); all stay where
+        they are after so many records."""
         state, held = self._begin(values, command, start, warm_up)
-        path = self._drive(values, state, held, np.int32(command.shape[1]))
+        path = self._drive(values, state, held, np.int32(records))
         return self._finish(values, path, command, start, gyro)
 
 
@@ -266,7 +276,7 @@ class PathReplay:
     """
 
     def __init__(self, plant: Plant, set_values: Callable[[jax.Array], Any], rows: int | None = None):
-        rows = rows or (ROWS if on_processor() else ACCELERATED)
+        rows, self._dt = rows or (ROWS if on_processor() else ACCELERATED), plant.dt
 
         def one(values: jax.Array, command: jax.Array, start: jax.Array, warm_up: int, gyro: bool) -> jax.Array:
             return path_of(plant, set_values(values), Commanded(command, start, warm_up), rows <= IN_ONE, gyro)
@@ -285,29 +295,63 @@ class PathReplay:
                                       for shape in shapes)
             self._run.compile(values, command, start, warm_up, gyro)
 
-    def __call__(self, values: np.ndarray, batch: Batch, trials: np.ndarray) -> np.ndarray:
-        """Paths (N, R + 1, 9) of sets (N, P), each on the trial of `batch` that trials (N,) names."""
+    def __call__(
+        self, values: np.ndarray, batch: Batch, trials: np.ndarray, records: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Paths (N, R + 1, 9) of sets (N, P), each on the trial of `batch` that trials (N,) names.
+
+        `records`: how many of its R records (`records_of`) each trial of the batch needs, by default all of them. A
+        processor then replays drives of about one length together, and none for much longer than it needs.
+        """
+        if on_processor():
+            return self._on_cores(values, batch, trials, records)
         count = len(values)
         spare = -count % self.rows
-        values = np.concatenate([values, np.repeat(values[-1:], spare, axis=0)]).astype(jnp.result_type(float))
-        trials = np.concatenate([trials, np.repeat(trials[-1:], spare)])
-        self.compile(values.shape[1], batch)
+        values, trials = _filled(values.astype(jnp.result_type(float)), spare), _filled(trials, spare)
         # Commands are much larger than the rest: an accelerator gets them once.
-        command, start = ((np if on_processor() else jnp).asarray(one) for one in (batch.command, batch.start))
+        command, start = (jnp.asarray(one) for one in (batch.command, batch.start))
 
         def part(first: int) -> jax.Array:
             chosen = trials[first : first + self.rows]
             return self._run(values[first : first + self.rows], command[chosen], start[chosen], batch.warm_up,
                              batch.gyro_index is not None)
 
+        # It computes while rows are sent and fetched; most of the spare ones stay there.
+        begun = [part(first) for first in range(0, len(values), self.rows)]
+        begun[-1] = begun[-1][: self.rows - spare // FETCHED * FETCHED]
+        return np.concatenate([np.asarray(paths) for paths in begun])[:count]
+
+    def _on_cores(self, values: np.ndarray, batch: Batch, trials: np.ndarray, records: np.ndarray | None) -> np.ndarray:
+        """As a call, on a processor: the longest drives first, as many at once as one program takes."""
+        values = values.astype(jnp.result_type(float))
+        command, start = np.asarray(batch.command), np.asarray(batch.start)
+        longest, gyro = command.shape[1], batch.gyro_index is not None
+        beyond = math.ceil(BEYOND / (self._dt * command.shape[2]))
+        needed = np.full(len(trials), longest) if records is None else np.minimum(records + beyond, longest)[trials]
+        order = np.argsort(-needed, kind="stable")
+        self.compile(values.shape[1], batch)
+
+        def part(first: int) -> np.ndarray:
+            mine = order[first : first + self.rows]
+            filled = _filled(mine, self.rows - len(mine))
+            found = self._run(values[filled], command[trials[filled]], start[trials[filled]], batch.warm_up, gyro,
+                              int(needed[mine[0]]))
+            return np.asarray(found)[: len(mine)]
+
         firsts = range(0, len(values), self.rows)
-        if on_processor():
-            parts = on_all_cores(lambda first: np.asarray(part(first)), firsts)
-        else:  # it computes while rows are sent and fetched; most of the spare ones stay there
-            begun = [part(first) for first in firsts]
-            begun[-1] = begun[-1][: self.rows - spare // FETCHED * FETCHED]
-            parts = [np.asarray(paths) for paths in begun]
-        return np.concatenate(parts)[:count]
+        parts = on_all_cores(part, firsts)
+        paths = np.empty((len(values), *parts[0].shape[1:]), parts[0].dtype)
+
+        def put(number: int) -> None:
+            paths[order[firsts[number] : firsts[number] + self.rows]] = parts[number]
+
+        on_all_cores(put, range(len(parts)))
+        return paths
+
+
+def _filled(rows: np.ndarray, spare: int) -> np.ndarray:
+    """Rows (N, ...) and the last one as often again as there are spare ones."""
+    return np.concatenate([rows, np.repeat(rows[-1:], spare, axis=0)])
 
 
 def _grid(t: np.ndarray, record: float, records: int) -> tuple[np.ndarray, np.ndarray]:

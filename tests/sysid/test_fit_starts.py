@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from conftest import TRUTH, UNICYCLE_SPACE, unicycle_plant
@@ -13,7 +14,7 @@ from sysid.errors.pose_objective import Objective, estimate_noise
 from sysid.replay.cores import Compiled
 from sysid.replay.differences import CourseReplay, DifferenceReplay, make_courses
 from sysid.replay.models import with_effects
-from sysid.replay.rollout import PathReplay, Replay, make_batch
+from sysid.replay.rollout import BEYOND, PathReplay, Replay, _Programs, make_batch
 from sysid.search import least_squares, starts
 from whill_mjx.effects import make_effect
 from whill_mjx.vehicle.parameters import describe, get_values
@@ -139,6 +140,34 @@ def test_drives_of_any_length_share_the_program_of_the_physics(unicycle_log):
     part = paths(values, dataclasses.replace(batch, command=batch.command[:, :40]), first)
     assert len(traced) == count
     np.testing.assert_allclose(part, whole[:, :41], atol=1e-6)
+
+
+def test_short_drives_are_replayed_together_and_no_further_than_they_are_measured(unicycle_log, monkeypatch):
+    whole = unicycle_log.training
+    trials = tuple(ended(trial, 1.0) if number % 2 else trial for number, trial in enumerate(whole))
+    plant, asked = unicycle_plant(), []
+    courses = CourseReplay(plant, trials, lambda values: values)
+    courses.paths.rows = 4
+    build = _Programs.__call__
+    monkeypatch.setattr(_Programs, "__call__", lambda one, *given: asked.append(given[-1]) or build(one, *given))
+    values = np.stack([TRUTH, 1.1 * TRUTH])
+    found = courses.simulate(values)
+    short = round((1.0 + BEYOND) / plant.dt) + 1  # records
+    assert min(asked) == short and max(asked) > 2 * short
+    monkeypatch.setattr(PathReplay, "__call__", lambda one, values, batch, rows, records: one._on_cores(
+        values, batch, rows, None))
+    for mine, full in zip(jax.tree.leaves(found), jax.tree.leaves(courses.simulate(values)), strict=True):
+        np.testing.assert_array_equal(mine, full)
+
+
+def ended(trial, end):
+    """The trial as if nothing had been recorded after `end` [s]."""
+    def kept(stream):
+        there = stream.t <= end
+        return dataclasses.replace(stream, **{name: table[there] for name, table in vars(stream).items()})
+
+    return dataclasses.replace(trial, command=kept(trial.command), odometry=kept(trial.odometry),
+                               ground_truth=kept(trial.ground_truth))
 
 
 def test_what_is_compiled_ahead_is_not_compiled_again(unicycle_log, monkeypatch):
