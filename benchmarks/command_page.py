@@ -45,7 +45,7 @@ flowchart LR
 | exit code | 0 done, 1 a file or the machine is at fault, 2 the command ([all](../reliability.md#exit-codes)) |
 | a mistake in an option | is named before anything is computed |
 | the same command again | long work goes on where it stopped ([what is promised](../reliability.md)) |
-| `make train`, `make test`, `make docs` | the same in a virtual environment that they make |
+| `make train`, `make test`, `make docs` | run training, tests and site build in a virtual environment that they make |
 """
 
 

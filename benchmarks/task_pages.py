@@ -158,7 +158,7 @@ def page(name: str) -> str:
 def training_text(task: Task) -> str:
     """One or two sentences on the presets that know the task."""
     if not task.budgets:
-        return "No preset has a budget for this task. Give `train` a number of steps: `--steps 200000`."
+        return "No preset but `smoke` has a budget for this task. Give `train` a number of steps: `--steps 200000`."
     budgets = ", ".join(f"`{name}` ({budget.steps:,} steps)" for name, budget in task.budgets.items())
     return f"Presets with a budget for this task: {budgets}. [Which preset](../../training.md#which-preset)."
 

@@ -66,8 +66,8 @@ CLAIMS = (
         "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
         "it. 1x is the "
         'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns "fresh" are '
-        "of the decision as it is, on logs that nobody had seen (draws 233, 234); four of them have backlash, which is "
-        "never named. Columns 2x and 4x are of an earlier decision, on logs that its weights were chosen with; the "
+        "of the decision as it is, on logs that nobody had seen (draws 233 to 235); six of them have backlash, which "
+        "is never named. Columns 2x and 4x are of an earlier decision, on logs that its weights were chosen with; the "
         "others are older still.",
         ("figure", "2x, fresh", "4x, fresh", "2x", "4x", "2x, noise x2", "4x, noise x2", "4x, heavy scooter"),
         tuple(
@@ -172,7 +172,6 @@ CLAIMS = (
         (
             ("whole loop with 200 refitted simulated days, two CPU cores", "{cpu_seconds|0.0166667}"),
             ("whole loop with 200 refitted simulated days, GPU", "{gpu_seconds|0.0166667}"),
-            ("without refitted days, two CPU cores", "{cpu_quick_seconds|0.0166667}"),
         ),
     ),
     Claim(
@@ -197,8 +196,9 @@ CLAIMS = (
         FIT,
         "Whether faults of driving logs are named",
         "logs",
-        "Logs of robots of many sizes with one fault of time or of frames each. Rightly named means that the sentence "
-        "says what it is, and no other sentence says what is not so. Faults too small to matter to a fit do not count.",
+        'Logs of robots of many sizes with one fault of time or of frames each. "Rightly named" means that one '
+        "sentence names the fault correctly and no other sentence claims something false. Faults too small to matter "
+        "to a fit do not count.",
         ("figure", "value", "logs"),
         (
             ("faults at the two larger sizes, rightly named", "{time_faults_named|%}", "{time_faults_named|n}"),

@@ -183,9 +183,8 @@ CLAIMS = (
         LEARNER,
         "Several GPUs",
         "scaling",
-        "Work per GPU is fixed: 2,048 chairs, and 16 x 64 replayed steps. 100 % is as many times the rate of one "
-        "GPU as "
-        "there are GPUs.",
+        "Work per GPU is fixed: 2,048 chairs, and 16 x 64 replayed steps. 100 % means that N GPUs reach N "
+        "times the rate of one.",
         ("GPUs", "environment steps/s", "of linear", "replayed steps/s", "of linear"),
         (
             ("1", "{env_steps_per_s_1}", "-", "{learner_replayed_steps_per_s_1}", "-"),
