@@ -49,7 +49,7 @@ def account(findings: Findings, priors: Thresholds) -> dict[str, Any]:
 def _outcome(findings: Findings, priors: Thresholds, judged: Posterior, number: int) -> str:
     """Why a set of effects is the verdict, or is not."""
     one = findings.sets[number]
-    if findings.against.get("+".join(one.effects)):
+    if findings.contradictions(one):
         return "contradicted"
     if len(one.effects) > MOST:
         return "tried to check the others"

@@ -79,17 +79,18 @@ def find_missing(
         usual = replace(asked, wander=seen.usual)
         nulls = run_null_refits(usual, judge, pairs, config.refit_nulls, config.seed, progress)
         outcome = checked(outcome, nulls, seen.ready.wander, config.thresholds)
-    stood: tuple[Support, ...] = ()
-    if outcome.verdict == "named":
-        # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
-        p_excess = (lambda _: 1.0) if alone else seen.usual.p_excess
-        stood = tuple(stand(outcome, seen.refitter, log.training, seen.evidence.groups, log.spec.track, p_excess))
-        outcome = guarded(outcome, stood, config.thresholds)
+    # Drives that stand alone do not show the noise, so nothing that is left in them contradicts an effect.
+    p_excess = (lambda _: 1.0) if alone else seen.usual.p_excess
+    stood: dict[tuple[str, ...], tuple[Support, ...]] = {}  # of each set of effects that was put to the test
+    while outcome.verdict == "named" and outcome.effects not in stood:
+        found = stand(outcome, seen.refitter, log.training, seen.evidence.groups, log.spec.track, p_excess)
+        stood[outcome.effects] = tuple(found)
+        outcome = guarded(outcome, found, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
     floor = floor_change(reference, log.training, config.thresholds.alpha)
-    result = Result(log, tuple(references), config, seen.ready, outcome, seen.evidence, seconds, nulls, stood,
-                    seen.noise, floor)
+    result = Result(log, tuple(references), config, seen.ready, outcome, seen.evidence, seconds, nulls,
+                    stood.get(outcome.effects, ()), seen.noise, floor)
     if alone and config.pose_delay and PARAMETER not in (*reference.space.names, *config.held):
         result = told_late(result, config.thresholds.alpha)
     return result
@@ -176,12 +177,11 @@ def stand(
 
 
 def guarded(found: Search, stood: Sequence[Support], thresholds: Thresholds) -> Search:
-    """The search without a name where one of its effects is contradicted."""
+    """The search without a name where one of its effects is contradicted, or with that of the next set of effects."""
     named = {one.hypothesis.effect for one in found.accepted}
     against = [each for one in stood if one.effect in named for each in one.against(thresholds)]
     if found.findings is not None:
-        return found.judged(found.findings.put_to_test([one.hypothesis.effect for one in found.accepted], against),
-                            thresholds)
+        return found.judged(found.findings.put_to_test(found.effects, against), thresholds)
     if against:
         found.verdict, found.reason = "unexplained", contradicted(named, found.share, against)
     return found

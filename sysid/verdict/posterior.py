@@ -122,6 +122,11 @@ class Findings:
         """With what contradicts a set of effects."""
         return replace(self, against={**self.against, "+".join(effects): list(against)})
 
+    def contradictions(self, one: TriedSet) -> list[str]:
+        """What contradicts a set of effects; empty too where it was not put to the test."""
+        return [each for names, found in self.against.items() if {*names.split("+")} == {*one.effects}
+                for each in found]
+
     def predictable(self, left: Left, random: float, alpha: float) -> dict[str, float]:
         """What is left though it could be predicted, by what shows it; `random`: share of what nothing predicts that
         counts as well (effects may act at random in part)."""
@@ -188,25 +193,25 @@ class Posterior:
 
 def posterior(findings: Findings, priors: Thresholds) -> Posterior:
     """Weigh what was tried: the verdict is where the posterior weight is, and `none` unless nothing has less than
-    `Thresholds.alpha` of it."""
-    chosen = choose(findings, priors)
-    one = None if chosen is None else findings.sets[chosen]
-    nothing, share = _weight_of_nothing(findings, priors, one), 0.0 if one is None else findings.named(one, priors)
-    against = [] if one is None else findings.against.get("+".join(one.effects), [])
-    logs = _log_weights(findings, priors, None if against else one)
+    `Thresholds.alpha` of it. A set that the drives contradict has no weight."""
+    best, chosen = choose(findings, priors, contradicted=True), choose(findings, priors)
+    most = None if best is None else findings.sets[best]
+    nothing, logs = _weight_of_nothing(findings, priors, most), _log_weights(findings, priors, most)
     rest = np.exp(np.array(list(logs.values())) - max(logs.values()))
     weights = {"noise" if findings.noise else "none": nothing,
                **dict(zip(logs, ((1 - nothing) * rest / rest.sum()).tolist(), strict=True))}
     if nothing >= priors.alpha:
         return Posterior("none", None, 0.0, UNSURE if findings.something(priors) else NOTHING, weights)
-    if one is not None and against:
-        return Posterior("unexplained", chosen, share, contradicted(one.effects, share, against), weights)
-    explains = f"explains {share:.0%} of what can be explained"
-    if max(logs, key=lambda name: logs[name]) != "unknown":
-        return Posterior("named", chosen, share, explains, weights)
-    after = findings.excess if one is None else one.left.excess
-    return Posterior("unexplained", chosen, share,
-                     f"the best of the catalogue {explains}, and {after:.0%} above the noise is left", weights)
+    against = [] if most is None else findings.contradictions(most)
+    withdrawn = "" if most is None or not against else contradicted(most.effects, findings.named(most, priors), against)
+    if chosen is not None and max(logs, key=lambda name: logs[name]) != "unknown":
+        share = findings.named(findings.sets[chosen], priors)
+        reason = f"explains {share:.0%} of what can be explained{'; ' if withdrawn else ''}{withdrawn}"
+        return Posterior("named", chosen, share, reason, weights)
+    share, after = (0.0, findings.excess) if most is None else (findings.named(most, priors), most.left.excess)
+    least = f"the best of the catalogue explains {share:.0%} of what can be explained"
+    return Posterior("unexplained", best, share, withdrawn or f"{least}, and {after:.0%} above the noise is left",
+                     weights)
 
 
 def _weight_of_nothing(findings: Findings, priors: Thresholds, best: TriedSet | None) -> float:
@@ -220,13 +225,13 @@ def _weight_of_nothing(findings: Findings, priors: Thresholds, best: TriedSet | 
 
 
 def _log_weights(findings: Findings, priors: Thresholds, best: TriedSet | None) -> dict[str, float]:
-    """Of what is missing, if anything: posterior weights of sets of effects, and of something unknown. This gains its
-    share of what can be explained beside the best set."""
+    """Of what is missing, if anything: posterior weights of sets of effects that nothing contradicts, and of something
+    unknown. This gains its share of what can be explained beside the best set, contradicted or not."""
     out: dict[str, float] = {}
     if best is None:
         return {"unknown": 0.0}
     for one in findings.sets:
-        if findings.able(one, priors):
+        if findings.able(one, priors) and not findings.contradictions(one):
             name = next((key for key in out if {*key.split(" + ")} == {*one.effects}), " + ".join(one.effects))
             weight = findings.log_weight(one.gain, len(one.effects), priors)
             out[name] = max(weight, out.get(name, -math.inf))
@@ -234,10 +239,11 @@ def _log_weights(findings: Findings, priors: Thresholds, best: TriedSet | None) 
     return {**out, "unknown": findings.log_weight(priors.share * (best.gain + max(0.0, *left.values())), 1, priors)}
 
 
-def choose(findings: Findings, priors: Thresholds) -> int | None:
+def choose(findings: Findings, priors: Thresholds, contradicted: bool = False) -> int | None:
     """The number of the set of the largest posterior weight, of which every effect is more than another form of the
-    others, if there is any."""
-    able = [i for i, one in enumerate(findings.sets) if findings.able(one, priors)]
+    others, if there is any; `contradicted`: also of those that the drives contradict."""
+    able = [i for i, one in enumerate(findings.sets)
+            if findings.able(one, priors) and (contradicted or not findings.contradictions(one))]
     return max(able, key=lambda i: findings.log_weight(findings.sets[i].gain, len(findings.sets[i].effects), priors),
                default=None)
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from sysid.missing.joint_fit import Refit, Start, moved_last
 from sysid.verdict.agreement import errors_of_sizes, half_width
 from sysid.verdict.forms import forms_of
-from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet, posterior
+from sysid.verdict.posterior import NOTHING, Findings, Left, TriedSet
 from sysid.verdict.rounds import (
     POLISH,
     TO_ITS_END,
@@ -23,17 +23,7 @@ from sysid.verdict.rounds import (
     pair_round,
 )  # fmt: skip
 from sysid.verdict.scan import DRAWS, null_days, scan_pairs
-from sysid.verdict.search_record import LARGEST, ROUNDS, WEIGHED, Candidate, PairScan, Search
-
-
-@dataclass(frozen=True)
-class Weighed:
-    """A set of effects that were refitted together, and what it was found among."""
-
-    numbers: TriedSet
-    members: tuple[Candidate, ...]  # the refit of all is the last one's
-    rivals: tuple[Sequence[Candidate], ...]  # what was refitted in the place of each
-    together: float | None = None  # p-value of "nothing is missing" where it was found as a pair
+from sysid.verdict.search_record import ROUNDS, WEIGHED, Candidate, PairScan, Search, Weighed
 
 
 def pairs_of(asked: Asked, seed: int = 0) -> PairScan:
@@ -62,7 +52,8 @@ def settle(asked: Asked, pairs: PairScan | None) -> Search:
             first = {weighed[0].numbers.effects[0]} if len(found.rounds) > 1 else set()
             weighed += [_weighed(asked, members, [[one] for one in members], together)
                         for members, together in pair_round(asked, pairs, first)]
-    return decided(asked, found, replace(findings, sets=tuple(one.numbers for one in weighed)), weighed)
+    found.weighed = weighed
+    return found.judged(replace(findings, sets=tuple(one.numbers for one in weighed)), asked.thresholds)
 
 
 def _one_by_one(asked: Asked, found: Search, findings: Findings) -> list[Weighed]:
@@ -187,22 +178,3 @@ def _left(asked: Asked, residual: np.ndarray) -> Left:
     excess = asked.excess(residual)
     return Left(excess, excess - asked.wander.unshared(residual, asked.refitter.drives.repeats),
                 asked.anything(residual))
-
-
-def decided(asked: Asked, found: Search, findings: Findings, weighed: Sequence[Weighed]) -> Search:
-    """The search with the verdict on what was tried."""
-    found.judged(findings, asked.thresholds)
-    number = posterior(findings, asked.thresholds).chosen
-    if number is None:
-        return found
-    chosen = weighed[number]
-    found.accepted, found.together = list(chosen.members), chosen.together
-    found.final = chosen.members[-1].refit
-    found.excess = found.excess[0], chosen.numbers.left.excess
-    for one in chosen.members:
-        if not any(each is one for listed in found.rounds for each in listed):
-            found.rounds.append([one])
-    classes = chosen.numbers.apart()
-    found.classes = [members[:LARGEST] for members in classes]
-    found.crowd = [name for members in classes for name in members[LARGEST:]]
-    return found

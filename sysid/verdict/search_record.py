@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from sysid.intervals.statistics import upper_rate
 from sysid.missing.catalogue import Hypothesis
 from sysid.missing.joint_fit import Refit
-from sysid.verdict.posterior import Findings, Thresholds, posterior
+from sysid.verdict.posterior import Findings, Thresholds, TriedSet, posterior
 
 LARGEST = 4  # members of a class
 ROUNDS = 3  # effects that are searched for one after the other, at most
@@ -26,6 +27,16 @@ class Candidate:
     p: float  # family-wise, of that gain
     share: float
     refit: Refit
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A set of effects that were refitted together, and what it was found among."""
+
+    numbers: TriedSet
+    members: tuple[Candidate, ...]  # the refit of all is the last one's
+    rivals: tuple[Sequence[Candidate], ...]  # what was refitted in the place of each
+    together: float | None = None  # p-value of "nothing is missing" where it was found as a pair
 
 
 @dataclass
@@ -47,13 +58,34 @@ class Search:
     together: float | None = None  # p-value of the scan of pairs, or of the weaker refit, where a pair was accepted
     findings: Findings | None = None  # the numbers that the verdict was reached from; None for drives that stand alone
     weights: dict[str, float] = field(default_factory=dict)  # posterior weights (`sysid.verdict.posterior.Posterior`)
+    weighed: Sequence[Weighed] = ()  # the sets of `findings`, with their refits
 
     def judged(self, findings: Findings, thresholds: Thresholds) -> Search:
-        """This search, with the verdict that its findings come to."""
-        weighed = posterior(findings, thresholds)
-        self.findings, self.weights = findings, weighed.weights
-        self.verdict, self.share, self.reason = weighed.verdict, weighed.share, weighed.reason
+        """This search, with the verdict that its findings come to and the set of effects that it is about."""
+        outcome = posterior(findings, thresholds)
+        self.findings, self.weights = findings, outcome.weights
+        self.verdict, self.share, self.reason = outcome.verdict, outcome.share, outcome.reason
+        if outcome.chosen is not None:
+            self._accept(self.weighed[outcome.chosen], findings)
         return self
+
+    def _accept(self, chosen: Weighed, findings: Findings) -> None:
+        self.accepted, self.together = list(chosen.members), chosen.together
+        self.final = chosen.members[-1].refit
+        self.excess = self.excess[0], chosen.numbers.left.excess
+        for one in chosen.members:
+            if not any(each is one for listed in self.rounds for each in listed):
+                self.rounds.append([one])
+        alone = {names for names, against in findings.against.items() if against}
+        classes = [[name for name in members if name == members[0] or name not in alone]
+                   for members in chosen.numbers.apart()]
+        self.classes = [members[:LARGEST] for members in classes]
+        self.crowd = [name for members in classes for name in members[LARGEST:]]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Those of the set that was accepted."""
+        return tuple(one.hypothesis.effect for one in self.accepted)
 
     @property
     def p_value(self) -> float:

@@ -30,7 +30,7 @@ from sysid.replay.rollout import vehicle_plant
 from sysid.verdict.falsification import course_of, put_to_test
 from sysid.verdict.null_refits import checked
 from sysid.verdict.null_refits import run as run_null_refits
-from sysid.verdict.pipeline import check_logs, find_missing
+from sysid.verdict.pipeline import check_logs, find_missing, guarded
 from sysid.verdict.posterior import Findings, posterior, read
 from sysid.verdict.preparation import expected_steps
 from sysid.verdict.result import LoopConfig
@@ -362,6 +362,18 @@ def test_a_pull_that_does_not_turn_with_the_room_is_no_slope(sloping):
     [tested] = put_to_test(moved, refitter, sloping.log.training, sloping.evidence.groups, sloping.log.spec.track,
                               sloping.prepared.wander.p_excess)
     assert [one.outcome for one in tested if one.falsifier.by == "heading along x"] == ["falsified"]
+
+
+def test_what_the_drives_contradict_gives_way_to_what_looks_like_it(sloping):
+    first = sloping.search.effects
+    search = replace(sloping.search, rounds=[*sloping.search.rounds])
+    wrong = [replace(one, interval=(-2.0, -1.0)) for one in sloping.stood]  # about manoeuvres that were held back
+    found = guarded(search, wrong, CONFIG.thresholds)
+    assert found.verdict == "named" and {*first, *found.effects} == {"slope", "wind"} and first != found.effects
+    assert tuple(one.effect for one in found.final.hypotheses) == found.effects
+    assert first[0] not in found.classes[0] and f"{first[0]} is wrong about" in found.reason
+    assert guarded(found, [replace(one, effect=found.effects[0]) for one in wrong], CONFIG.thresholds
+                   ).verdict == "unexplained"
 
 
 def test_everything_fixed_beforehand_is_in_the_manifest(sloping):

@@ -294,6 +294,25 @@ def test_saved_findings_give_the_same_verdict(tmp_path):
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize(("gain", "verdict"), [(29.0, "named"), (15.0, "unexplained")])
+def test_what_is_contradicted_makes_room_for_the_next_that_explains_enough(gain, verdict):
+    sets = [tried(0.0, gain=40.0), tried(0.0, effects=("slope",), gain=gain)]
+    assert posterior(findings(39.0, sets), Thresholds()).chosen == 0
+    found = posterior(findings(39.0, sets).put_to_test(["quadratic_drag"], ["it grows with the time"]), Thresholds())
+    assert found.verdict == verdict and found.chosen == (1 if verdict == "named" else 0)
+    assert found.reason.endswith("but it grows with the time") and found.weights.get("quadratic_drag", 0.0) == 0.0
+    both = findings(39.0, sets).put_to_test(["quadratic_drag"], ["x"]).put_to_test(["slope"], ["y"])
+    assert posterior(both, Thresholds()).verdict == "unexplained"
+
+
+@pytest.mark.quick
+def test_a_pair_is_contradicted_in_whichever_order_its_effects_are_given():
+    pair = tried(0.0, effects=("slope", "wind"), gain=40.0)
+    given = findings(39.0, [pair]).put_to_test(["wind", "slope"], ["it is not foretold"])
+    assert given.contradictions(pair) == ["it is not foretold"]
+
+
+@pytest.mark.quick
 def test_every_hypothesis_vanishes_at_zero():
     spec, params = preset("whill_cr_physical")
     found = hypotheses(spec, params)
