@@ -88,7 +88,14 @@ class BatchEnv:
         Args:
             state: from `reset` or the previous `step`.
             actions: (N, 2), each in [-1, 1].
+
+        Raises:
+            ValueError: actions of another shape.
         """
+        wanted = (*state.origin.shape[:1], 2)
+        if jnp.shape(actions) != wanted:
+            raise ValueError(f"actions have the shape {jnp.shape(actions)}; a step takes {wanted}: speed and yaw rate "
+                             "of each instance, as shares of their limits.")
         return self._split(self._step)(state, actions)
 
     def begin_one(

@@ -90,7 +90,7 @@ def find_device(name: str | None) -> jax.Device | None:
         return None
     try:
         return jax.local_devices(backend=name)[0]
-    except RuntimeError as error:
+    except (RuntimeError, AttributeError) as error:  # the second of a name that is no text
         if name == "cpu":
             return None  # JAX_PLATFORMS leaves it out
         raise ValueError(f"device is {name!r}, which JAX does not have here ({error}). Give None for its own choice "

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from whill_mjx.io.command_line import POSITIVE, Range, listen, refusing, run, starts
+from whill_mjx.io.command_line import POSITIVE, OptionError, Range, listen, refusing, run, starts
 
 if starts(__name__):
     listen()
@@ -19,11 +19,10 @@ import numpy as np
 from whill_mjx.io.folders import check_file, note_written, write_whole
 from whill_mjx.vehicle.vehicle_file import load_vehicle
 from whill_mjx.world.maps import MapScene, Reach, make_map_scene, reach_of, read_map, wall_segments
-from whill_mjx.world.maps.nav2 import as_nav2
+from whill_mjx.world.maps.nav2 import NAV2, as_nav2
 from whill_mjx.world.maps.picture import from_above
-
-NAV2 = (".yaml", ".yml")
-"""Endings of nav2 maps."""
+from whill_mjx.world.maps.places import NoRoom
+from whill_mjx.world.maps.playable import has_cells
 
 
 @dataclass(frozen=True)
@@ -56,10 +55,15 @@ def main(options: Import) -> None:
     with refusing():
         for path in outs:
             check_file("--out", path)
+        _check_effect(options)
         name, reach = _needed(options)
         grid = read_map(options.file, options.cell, options.scale)
         try:
             made = make_map_scene(grid, reach)
+        except NoRoom as error:
+            width = "what it needs" if options.width is None else f"{options.width:g} m"
+            raise ValueError(f"{options.file}: {error} Where the map is right, ask for less: --vehicle is "
+                             f"{options.vehicle}, and --width is {width}.") from None  # fmt: skip
         except ValueError as error:
             raise ValueError(f"{options.file}: {error}") from None
     size = np.array(grid.cells.shape[::-1]) * grid.resolution
@@ -89,6 +93,13 @@ def _write(made: MapScene, outs: Sequence[Path], pixels: int) -> None:
     for path, content in zip(outs, contents, strict=True):
         write_whole(path, content)
         note_written(path)
+
+
+def _check_effect(options: Import) -> None:
+    """Refuse an option that has no effect on a map of this kind."""
+    for name in ("cell", "scale"):
+        if has_cells(options.file) and getattr(options, name) != getattr(Import, name):
+            raise OptionError(f"--{name}: has no effect on {options.file}, which has cells of its own. Leave it out.")
 
 
 def _needed(options: Import) -> tuple[str, Reach]:

@@ -30,12 +30,11 @@ if starts(__name__):
 
 from dreamer.training import checkpoint, parallel
 from whill_mjx.devices import join
-from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import claim_folder
 from whill_mjx.learning.identity import KIND, OUTPUTS
 from whill_mjx.learning.index_page import list_results, write_index
 from whill_mjx.learning.options import TrainOptions, choose_preset, preset_name
-from whill_mjx.learning.outcome import evaluate_policy, export
+from whill_mjx.learning.outcome import diverged_note, evaluate_policy, export, outcome_line
 from whill_mjx.learning.refusals import check
 from whill_mjx.learning.setup import Preset
 from whill_mjx.learning.trainings import Stage, best_params, train_baseline, train_policy
@@ -107,13 +106,7 @@ def finish(
     evaluation["seconds"] = {"this_command": seconds, "training": result.wall_s}
     write_json(options.out / "evaluation.json", evaluation)
     write_index(options.out, evaluation, options.task)
-    share, interval = evaluation["policy"]["success"], evaluation["policy"]["success_interval_95"]
-    baselines = [name for name in ("planner", "random") if name in evaluation]
-    others = ", ".join(f"{name} {percent(evaluation[name]['success'])}" for name in baselines)
-    say(
-        f"success {percent(share)} (95% interval {percent(interval[0])} to {percent(interval[1])}), {others}; "
-        f"policy file {policy}; {seconds / 60:.1f} min"
-    )
+    say(f"{outcome_line(evaluation)}; policy file {policy}; {seconds / 60:.1f} min{diverged_note(evaluation)}")
     for line in list_results(options.out):
         say(line)
     return evaluation

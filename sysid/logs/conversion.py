@@ -99,12 +99,13 @@ def _of_known(config: ConvertConfig) -> Found:
     """What a dataset or a measured set holds."""
     if config.columns:
         raise ValueError(f"--columns: only tables have columns to name; {config.source} is none. Leave it out.")
+    kind = detect_format(config.source)
     if given := [name for name in OF_RECORDINGS if getattr(config, name) != getattr(ConvertConfig, name)]:
         raise ValueError(f"--{given[0].replace('_', '-')}: {config.source} is a dataset, which says this itself. "
                          "Leave it out.")
     log = load_whole(config.source, config.select)
     names, notes = [trial.name for trial in log.trials], list(log.notes)
-    of_dataset = detect_format(config.source) == "dataset"
+    of_dataset = kind == "dataset"
     folders = {name: config.source / "trials" / name for name in names} if of_dataset else {}
     drives = [_written(one) for one in folders.values()] or [trial_drive(trial) for trial in log.trials]
     drives = [one if one.ground_truth is None else replace(one, ground_truth=at_axle(one.ground_truth, config))
@@ -161,6 +162,8 @@ def _bags_drives(
 
 def _of_tables(config: ConvertConfig, there: VehicleSpec | None) -> Found:
     """What tables or a LeRobotDataset hold."""
+    if config.stamp != ConvertConfig.stamp:
+        raise ValueError(f"--stamp {config.stamp}: rows of tables have one time each. Leave it out.")
     episodes = lerobot.read(config.source) if is_lerobot(config.source) else lerobot.Episodes()
     noted = episodes.spec if config.vehicle == ConvertConfig.vehicle else None
     spec = _spec(config, there, noted)
@@ -183,7 +186,8 @@ def _text_drives(
                          "those without into a dataset of their own.")
     for one in found:
         source = Source(config.source, {column.role.partition(".")[0]: column.file for column in one.columns})
-        cut_out, said = cut_drives(re.sub(r"[^\w.-]+", "_", one.name), one.tables, source, config)
+        name = re.sub(r"[^\w.-]+", "_", one.name).lstrip(".") or "drive"  # hidden folders are no trials
+        cut_out, said = cut_drives(name, one.tables, source, config)
         drives += cut_out
         notes += [f"{one.name}: {note}" for note in (*one.notes, *said)]
     notes += [f"column {one}{f' ({one.why})' if one.why else ''}" for one in found[0].columns]

@@ -11,6 +11,7 @@ import numpy as np
 from sysid.logs.contradictions import another_clock, contradictions
 from sysid.logs.directions import ALIKE, UNLIKE
 from sysid.logs.metrics import CHANNELS, ideal_replay, replicate_groups, replicate_noise
+from sysid.logs.odd_trials import before_its_commands, odd_trials, short_timeout
 from sysid.logs.records import CHECK, Command, Log, Trial, logged_pose
 from sysid.logs.stream_quality import Shift, response_shift, speeds, standstill
 from sysid.logs.time_faults import forward_jump, pauses, set_forward, time_faults, uncommanded
@@ -162,6 +163,7 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
             seen.append(f"{channel}: its motion goes with the commands neither as it is nor with a sign reversed: "
                         "check its clock and its frame.")
         other = (another_clock(channel, trials, "commands") or _exchanged(channel, trials)) if seen else ""
+        found += [] if seen or contradicted[channel] else before_its_commands(channel, shifts)
         found += [other] if other else seen  # such a log shows neither sign nor unit
         if contradicted[channel]:
             continue
@@ -169,7 +171,7 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
                          "y must be in metres, of the reference point.")
-    found += time_faults(trials)
+    found += [*odd_trials(trials), *short_timeout(trials, log.fields.get("command_timeout")), *time_faults(trials)]
     gone = () if contradicted["ground_truth"] else lost(log)
     if gone:
         found.append(f"ground_truth: in {len(gone)} of {len(trials)} trials ({gone[0]}, ...) its yaw contradicts the "

@@ -154,8 +154,9 @@ def _excitation_line(name: str, trials: list[dict[str, Any]]) -> str:
     omega = min(one["omega"][0] for one in all_of), max(one["omega"][1] for one in all_of)
     still = [float(np.median([one["standstill"][k] for one in all_of])) for k in (0, 1)]
     peaks = [one["acceleration"] for one in all_of if np.isfinite(one["acceleration"])]
+    peak = f"{max(peaks):.2f}" if peaks else "-"
     return (f"  {name} {v[0]:+.2f} .. {v[1]:+.2f}  {omega[0]:+.2f} .. {omega[1]:+.2f}  {total('reversals'):5.0f} "
-            f"{total('turn_changes'):5.0f} {total('slow_seconds'):5.1f} {max(peaks, default=float('nan')):5.2f} "
+            f"{total('turn_changes'):5.0f} {total('slow_seconds'):5.1f} {peak:>5} "
             f"{total('distance'):5.0f} {total('turn'):5.0f}  {still[0]:.1f} / {still[1]:.1f}")
 
 

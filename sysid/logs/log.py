@@ -66,7 +66,7 @@ def load_log(folder: str | Path) -> Log:
     fields = read_fields(folder / "dataset.toml")
     spec, notes = spec_from_fields(folder / "dataset.toml", fields)
     held_out = fields.get("held_out", [])
-    trial_folders = sorted(path for path in (folder / "trials").glob("*") if path.is_dir())
+    trial_folders = sorted(path for path in (folder / "trials").glob("[!.]*") if path.is_dir())
     if not trial_folders:
         raise ValueError(f"{folder / 'trials'}: no trial in it. Each trial is a folder trials/NAME with command.csv.")
     unknown = sorted(set(held_out) - {path.name for path in trial_folders})

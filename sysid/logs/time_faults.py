@@ -10,6 +10,7 @@ from sysid.logs.command_timeout import command_timeout
 from sysid.logs.records import Trial, logged_pose
 
 BURST = 0.2  # of the mean interval, below which the median interval shows bursts
+BURSTS = 5  # of them at least: one long interval is a pause
 PAUSE = (0.5, 5.0)  # s and mean intervals: the least gap that is looked at
 MOVED = 0.5  # share of the way that a speed gives over a gap, below which the gap was none
 UNEVEN = 0.2  # of the rows of a stream without a rate
@@ -128,4 +129,5 @@ def _between_bursts(t: np.ndarray) -> float:
     """Interval between rows (T,) that half of the time is spent in longer ones [s]; 0 where they come in no bursts."""
     steps = np.sort(np.diff(t))
     wait = float(steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)])
-    return wait if np.median(steps) < BURST * steps.mean() and wait > 2 * steps.mean() else 0.0
+    often = int((steps >= wait).sum()) >= BURSTS
+    return wait if often and np.median(steps) < BURST * steps.mean() and wait > 2 * steps.mean() else 0.0

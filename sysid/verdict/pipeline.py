@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from sysid import command_line
 from sysid.errors.features import bin_width, check_length
 from sysid.errors.noise import NoiseLevels
 from sysid.logs.log import check_same_vehicle
+from sysid.logs.odd_trials import content_of
 from sysid.logs.records import Log, Trial
 from sysid.missing.catalogue import PARAMETER
 from sysid.missing.days import Reference, Wander
@@ -125,15 +123,6 @@ def watched(log: Log, references: Sequence[Log], config: LoopConfig, vehicle: An
     with command_line.progress_bar(steps, "close the loop") as progress:
         progress(0, "reference vehicle")
         return find_missing(log, references, config, vehicle, progress)
-
-
-def content_of(trial: Trial) -> str:
-    """Hash of all that was recorded of a drive, whatever its name."""
-    found = hashlib.sha256(trial.command.table.tobytes())
-    for stream in (trial.odometry, trial.ground_truth, trial.gyro):
-        for one in (() if stream is None else vars(stream).values()):
-            found.update(np.ascontiguousarray(one).tobytes() if isinstance(one, np.ndarray) else b"-")
-    return found.hexdigest()
 
 
 def check_logs(log: Log, references: Sequence[Log] = ()) -> None:

@@ -107,6 +107,14 @@ def test_terminal_observation_is_kept_and_the_next_call_starts_a_new_episode(bat
     assert not bool(on.first.any()) and np.asarray(on.reward).any()
 
 
+@pytest.mark.parametrize("shape", [(2,), (COUNT, 1), (COUNT, 3), (COUNT, 2, 1), (COUNT + 1, 2)])
+def test_actions_of_another_shape_are_refused(batch, shape):
+    many, reset, _ = batch
+    state, _ = jax.eval_shape(reset, jax.random.key(0))
+    with pytest.raises(ValueError, match=rf"a step takes \({COUNT}, 2\)"):
+        jax.eval_shape(many.step, state, jnp.zeros(shape))
+
+
 def test_a_batch_equals_its_instances_one_by_one(batch):
     many, reset, advance = batch
     state, _ = reset(jax.random.key(1))

@@ -66,6 +66,13 @@ def test_seeds_decide_the_world_and_info_tells_the_pose(env):
     np.testing.assert_array_equal(env.render(), obs)
 
 
+def test_observations_are_the_users_own(env):
+    image, _ = env.reset(seed=3)
+    image[:] = 7
+    again, *_ = env.step(STILL)
+    assert (image == 7).all() and (again != 7).any()
+
+
 def test_misuse_is_explained(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import subprocess
 import sys
 from functools import partial
@@ -417,6 +418,43 @@ def test_the_command_asks_for_the_room_of_the_vehicle_that_is_named(tmp_path, ca
     assert clearances(vehicle="create", width=0.6) == "clearance for create: 0.3 m on the way, 0.4 m at start and goal"
     with pytest.raises(OptionError, match="unknown vehicle 'nothing'"):
         clearances(vehicle="nothing")
+
+
+@pytest.mark.parametrize(("name", "option"), [("made:0", "scale"), ("office.yaml", "scale"), ("office.YML", "cell")])
+def test_the_command_refuses_an_option_that_has_no_effect_on_the_map(tmp_path, name, option):
+    with pytest.raises(OptionError, match=f"--{option}: has no effect on {name}, .*Leave it out"):
+        maps.main(maps.Import(Path(name), tmp_path / "scene", **{option: 0.5}))
+
+
+@pytest.mark.parametrize(("name", "remedy"), [
+    ("map_0.yaml", "Check the resolution and the thresholds."), ("made:0", "Take another seed."),
+    ("town.osm", r"Take smaller cells \(--cell of python"), ("hall.npy", r"take smaller cells \(--scale and --cell of"),
+])  # fmt: skip
+def test_a_map_without_room_comes_with_the_remedy_of_its_kind_and_of_the_options(tmp_path, monkeypatch, name, remedy):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "town.osm").write_text(OSM.format(NODES))
+    np.save("hall.npy", np.pad(np.argwhere(np.ones((60, 60))) * 0.1, ((0, 0), (0, 1))))
+    written_map(tmp_path, (0, 0, 0))
+    asked = "Where the map is right, ask for less: --vehicle is warthog, and --width is"
+    with pytest.raises(OptionError, match=rf"^{name}: .*needs 50 m. .*{remedy}.* {asked} 100 m"):
+        maps.main(maps.Import(Path(name), vehicle="warthog", width=100.0))
+
+
+def test_a_hall_too_small_for_the_vehicle_names_the_options_and_the_fields_of_the_task(tmp_path):
+    np.save(tmp_path / "hall.npy", np.pad(np.argwhere(np.ones((25, 25))) * 0.1, ((0, 0), (0, 1))))
+    message = "no start and goal 3 to 12 m apart: .*--scale and --cell .*Where the map is right, {}"
+    with pytest.raises(OptionError, match=message.format("ask for less: --vehicle is warthog, and --width is what it")):
+        maps.main(maps.Import(tmp_path / "hall.npy", tmp_path / "scene", vehicle="warthog"))
+    with pytest.raises(ValueError, match=message.format("lower the task's fields: passing is 0.45 m .* nearest 3 m")):
+        check_world(MapGoal(map=tmp_path / "hall.npy"))
+
+
+def test_a_task_takes_a_map_as_a_path_and_refuses_what_is_no_name(tmp_path):
+    task = MapGoal(map=tmp_path / "office.yaml")
+    assert task == MapGoal(map=str(tmp_path / "office.yaml")) and hash(task)
+    for wrong in (3, None, ["made:0", "made:1"]):
+        with pytest.raises(ValueError, match=f"map is {re.escape(str(wrong))}; it must be a path, .*Give a file"):
+            MapGoal(map=wrong)
 
 
 @pytest.mark.parametrize(("metre", "length"), [(110.0, 2.0), (4.0, 50.0), (700.0, 0.2)])

@@ -115,6 +115,9 @@ def test_packed_bytes_are_unpacked():
     ("a.pcd", b"VERSION 0.7\nFIELDS x y z\n", "Export it again"),
     ("a.stl", b"solid nothing", "Export it again"),
     ("a.glb", b"glTF....", "Export it again"),
+    ("a.stl", bytes(80) + (60).to_bytes(4, "little") + bytes(50 * 59), "cut short: .* counts 60 triangles, and 59 are"),
+    ("a.gltf", b"{VERSION", "JSON.* line 1 column 2"),
+    ("a.pcd", b"FIELDS x y z\nTYPE F F Q\nSIZE 4 4 9\nPOINTS 1\nDATA binary\n", "type Q and the size 9 .known: F 4,"),
 ])  # fmt: skip
 def test_a_damaged_file_is_refused_in_one_line(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
@@ -231,6 +234,20 @@ def test_a_part_of_a_scene_may_not_borrow_the_corners_of_another(tmp_path):
     (tmp_path / "room.glb").write_bytes(data.replace(faces.tobytes(), wrong.tobytes()))
     with pytest.raises(ValueError, match=r"room.glb.*the corner 9, and the corners are 0 to 7"):
         read_map(tmp_path / "room.glb")
+
+
+@pytest.mark.parametrize("face", ["0 1 2", "1 2 0", "1/1 0/1 2/1", "1 2 3 0", "3 00//1 2 # 5"])
+def test_an_obj_face_with_the_corner_0_is_refused(tmp_path, face):
+    file = tmp_path / "room.obj"
+    file.write_text("".join(f"v {k % 4} {k // 4} 0\n" for k in range(12)) + f"f 1 2 10\nf {face}\n")
+    with pytest.raises(ValueError, match=r"room.obj.*the corner 0, and the corners begin at 1\). Export it again"):
+        read_map(file)
+
+
+def test_a_cloud_of_complex_numbers_is_refused(tmp_path):
+    np.save(tmp_path / "room.npy", cloud_of_a_room() + 1j)
+    with pytest.raises(ValueError, match=r"room.npy.*array of complex128 .*real numbers are needed"):
+        read_map(tmp_path / "room.npy")
 
 
 @pytest.mark.parametrize("line", ["v 1 2", "v 1"])

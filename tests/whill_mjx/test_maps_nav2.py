@@ -25,6 +25,12 @@ INLINE = "{{image: {image}, resolution: 0.05, origin: [-1.5, 2.0, 0.3], negate: 
          "occupied_thresh: {occupied}, free_thresh: {free}}}\n"
 
 
+@pytest.mark.parametrize("name", ["m.stl", "c.npy", "x.osm", "bad.gltf", "map.pgm"])
+def test_other_kinds_are_sent_to_the_function_and_the_command_that_read_them(name):
+    with pytest.raises(ValueError, match=rf"{name}: load_map reads only nav2 .*read_map.*python -m whill_mjx.maps"):
+        load_map(name)
+
+
 def png(samples, depth, kind, *chunks):
     """Bytes of a PNG of samples (rows, columns, channels), written here so that its samples are known."""
     def chunk(name, data):

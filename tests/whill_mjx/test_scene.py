@@ -9,6 +9,7 @@ import pytest
 
 from whill_mjx.vehicle.specs import WHILL_CR
 from whill_mjx.world.scene import Boxes, box, clearance, collides, footprint, no_boxes, overlaps, stack_boxes
+from whill_mjx.world.solids import post
 
 pytestmark = pytest.mark.quick
 GREY = jnp.full(3, 0.5)
@@ -83,3 +84,11 @@ def test_overlap_agrees_with_points_sampled_over_both_rectangles():
         disagreements += found[i] != sampled
     assert 20 < found.sum() < 180
     assert disagreements <= 3  # overlaps thinner than the sampling
+
+
+@pytest.mark.parametrize("size", [-0.4, 0.0, float("nan"), float("inf")])
+def test_a_thing_of_no_size_is_refused_with_the_name_of_the_size(size):
+    with pytest.raises(ValueError, match="width is .* must be above 0"):
+        box(0.0, 0.0, 1.0, size, 1.0, (1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="radius is .* must be above 0"):
+        post(0.0, 0.0, 1.0, size, (1.0, 0.0, 0.0))

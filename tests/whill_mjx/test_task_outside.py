@@ -101,7 +101,11 @@ def test_it_is_trained_and_evaluated_from_the_command_line(file, tmp_path):
 @pytest.mark.parametrize(("text", "reference", "said"), [
     ("", "{file}:Parkign", "has no task 'Parkign' .known: none"),
     ("x = ", "{file}:Parking", "cannot be imported: SyntaxError"),
-    ("import whill_mjx_nowhere", "{file}:Parking", "cannot be imported: No module named 'whill_mjx_nowhere'"),
+    ("import whill_mjx_nowhere", "{file}:Parking", "line 1: cannot be imported: No module named 'whill_mjx_nowhere'"),
+    ("import math\nx = float('0,5')", "{file}:Parking", "{file}, line 2: cannot be imported: ValueError: could.*0,5"),
+    ("from dataclasses import dataclass\n@dataclass\nclass Parking:\n    bay: list = []", "{file}:Parking",
+     "{file}, line 2: cannot be imported: ValueError: mutable default.*Correct the file"),
+    ("raise RuntimeError('two\\nlines.')", "{file}:Parking", "line 1: cannot be imported: RuntimeError: two lines. C"),
     ("Parking = 3", "{file}:Parking", "3 is no task"),
     ("", "nowhere.py:Parking", "no such file nowhere.py"),
     ("", "no_module_at_all:Parking", "No module named 'no_module_at_all'"),
@@ -111,9 +115,20 @@ def test_a_task_that_cannot_be_had_is_one_line(text, reference, said, tmp_path):
     path = tmp_path / f"wrong_{abs(hash((text, reference)))}.py"
     path.write_text(text)
     reference = reference.format(file=path)
-    with pytest.raises(OptionError, match=said) as caught:
+    with pytest.raises(OptionError, match=said.format(file=path)) as caught:
         named_task(reference)
     assert "\n" not in str(caught.value) and str(caught.value).startswith(f"--task {reference}: ")
+
+
+@pytest.mark.quick
+def test_a_module_that_cannot_be_imported_is_named_with_its_line(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "wrong_room").mkdir()
+    (tmp_path / "wrong_room" / "bays.py").write_text("import math\nimport whill_mjx_nowhere")
+    with pytest.raises(ValueError, match="wrong_room.bays, line 2: cannot be imported: No module named .*Install it"):
+        find_task("wrong_room.bays:Parking")
+    with pytest.raises(ValueError, match="No module named 'wrong_room.bay'. Give package.module:TASK"):
+        find_task("wrong_room.bay:Parking")
 
 
 HEAD = """from dataclasses import dataclass

@@ -27,6 +27,8 @@ from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.folders import FolderRefused
 from whill_mjx.learning.checks import Stopper, keep_best, read_best
 from whill_mjx.learning.options import TrainOptions, choose_preset
+from whill_mjx.learning.outcome import diverged_note
+from whill_mjx.learning.refusals import check_stop_success
 from whill_mjx.learning.setup import find_preset, functional_env, make_evaluation_env, with_repeat
 from whill_mjx.learning.shaping import SAFETY, Safety, find_safety, limited_policy, limiter_of, penalty
 from whill_mjx.learning.trainings import Trained, best_params
@@ -217,6 +219,25 @@ def test_a_bad_vehicle_file_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ValueError, match="schema is 9; this version reads schema 1"):
         main(TrainOptions(out=tmp_path / "run", vehicle=bad, preset="smoke"))
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.quick
+def test_a_share_of_successes_that_can_never_come_is_refused():
+    class Won(ObstacleCourse):
+        def endings(self, moment):
+            return {"collision": moment.collided, "won": moment.reached}
+
+    with pytest.raises(OptionError, match=r"--stop-success 0.9: .* no ending 'success' \(it has: collision, won\)"):
+        check_stop_success(0.9, Won())
+    check_stop_success(None, Won())
+    check_stop_success(0.9, ObstacleCourse())
+    check_stop_success(0.9, make_task("follow"))
+
+
+@pytest.mark.quick
+def test_the_last_line_says_why_episodes_diverged():
+    assert "diverged: 75% of the episodes: a reward, a" in diverged_note({"policy": {"diverged": 0.75}})
+    assert diverged_note({"policy": {"diverged": 0.0}}) == ""
 
 
 def contents(folder):

@@ -90,6 +90,14 @@ def test_motion_does_not_depend_on_the_place_and_heading_in_the_world():
     np.testing.assert_allclose(reference_pose(model, there.qpos), expected, atol=1e-3)
 
 
+@pytest.mark.quick
+def test_as_many_values_as_names_are_set():
+    _, params = preset("whill_cr")
+    with pytest.raises(ValueError, match="1 names of parameters and 2 values"):
+        set_values(params, ["body.mass"], jnp.array([1.0, 2.0]))
+
+
+
 def test_slip_separates_odometry_from_the_body():
     """A skid-steered vehicle on soft ground turns less than its wheels say."""
     model, params, period = compiled_period("warthog_physical")

@@ -47,7 +47,8 @@ def test_intervals_and_provenance_are_kept(saved):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("schema = 1", "schema = 7", "schema is 7; this version reads schema 1"),
+        ("schema = 1", "schema = 7", "schema is 7; this version reads schema 1. A newer version wrote the file"),
+        ("schema = 1\n", "", "has no schema, .*Add schema = 1"),
         ('kind = "micromobility-vehicle"', 'kind = "car"', "kind is 'car'.*Give a vehicle file"),
         ('name = "pid_drive"', 'name = "warp_drive"', "unknown effect 'warp_drive' .*known: .*pid_drive"),
         ('unit = "kg"', 'unit = "lb"', "body.mass is in 'lb'; it must be in 'kg'"),
@@ -55,7 +56,7 @@ def test_intervals_and_provenance_are_kept(saved):
         ("value = 52.0", "value = -52.0", "must be positive"),
         ("wheel_radius = 0.1325", "wheel_radius = -1.0", "wheel_radius is -1.0; it must be positive"),
         ("wheel_radius = 0.1325", "wheel_size = 0.1325", "Remove the entry"),
-        ("schema = 1", "schema 1", "not a TOML file"),
+        ("schema = 1", "schema 1", "not a TOML file: .*at line 1, .*Correct the line"),
         ("schema = 1", "schema = true", "schema is True"),
         ("track = 0.496", "track = true", "spec.track is True; it must be a number"),
         ("body_length = 0.985", 'body_length = "x"', "spec.body_length is 'x'; it must be a number"),
@@ -237,12 +238,20 @@ def test_the_wheels_of_a_skid_drive_of_a_short_file_turn_as_commanded(tmp_path):
     (SHORT.replace("yaw = 0.5", "yaw = 50"), r"spec.camera.yaw is 50"),
     (SHORT.replace("[spec.camera]", "rear_axle_x = 5.0\n[spec.camera]"), "axle 5.* m from the middle of the body"),
     (SHORT.replace("track = 0.16", "track = 0.5"), "spec.track is 0.5 m and spec.body_width"),
+    (SHORT.replace("radius = 0.033", "radius = 0.33"), "wheel_radius is 0.33 m and spec.body_height 0.192 m"),
 ])  # fmt: skip
 def test_a_short_file_with_a_mistake_is_one_line(text, said, tmp_path):
     path = tmp_path / "burger.toml"
     path.write_text(text)
     with pytest.raises(ValueError, match=said):
         load_vehicle(path)
+
+
+@pytest.mark.parametrize("spec", SPECS.values(), ids=lambda spec: spec.name)
+def test_every_built_in_vehicle_fulfils_the_rules_of_a_short_file(spec, tmp_path):
+    path = save_vehicle(tmp_path / "short.toml", spec, preset_params(spec))
+    path.write_text(path.read_text().partition("[body.")[0])
+    assert load_vehicle(path)[0] == spec
 
 
 def test_a_turned_mount_looks_where_it_says():

@@ -127,7 +127,7 @@ class WhillEnv(Carried, gymnasium.Env):
             close_window()
 
     def _shown(self, time_step: Any) -> Any:
-        obs = jax.tree.map(np.asarray, time_step.obs)
+        obs = jax.tree.map(np.array, time_step.obs)  # copies: JAX's own cannot be changed in place
         self._image = None if isinstance(obs, dict) else obs
         if self.render_mode == "human":
             show_window(self._picture())

@@ -45,6 +45,11 @@ except ImportError:  # a Python that was built without it
     pass
 else:
     BROKEN_ARCHIVE += (lzma.LZMAError,)
+BINARY = {b"\x1f\x8b": "a gzip archive", b"PK\x03\x04": "a zip archive", b"BZh": "a bzip2 archive",
+          b"\xfd7zXZ": "an xz archive", b"PAR1": "a Parquet file", b"\x89MCAP": "an MCAP recording",
+          b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "an SQLite database", b"\x89PNG": "a PNG image",
+          b"\x89HDF": "an HDF5 file", b"\xd0\xcf\x11\xe0": "an old Office document", b"%PDF": "a PDF document"}
+"""How files begin that are no text, and what they are."""
 
 
 def read_bytes(path: str | Path, limit: int, missing: str) -> bytes:
@@ -77,6 +82,10 @@ def read_text(path: str | Path, limit: int, missing: str) -> str:
 
 def decoded(path: str | Path, data: bytes) -> str:
     """The text of UTF-8 bytes; ValueError names the first line that is not text."""
+    kind = next((kind for begin, kind in BINARY.items() if data.startswith(begin)), None)
+    if kind is not None:
+        raise ValueError(f"{path}: is {kind}, whatever its name says, and no text. Give a text file; unpack an archive "
+                         "first.")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -15,6 +15,7 @@ from whill_mjx.evaluation.drivers import planner_driver, random_driver
 from whill_mjx.evaluation.episodes import episode_keys
 from whill_mjx.evaluation.policies.novelty import SURPRISE, largest_surprise, limits
 from whill_mjx.evaluation.policies.policy_file import camera_contract, sensor_contract
+from whill_mjx.io.fields import percent
 from whill_mjx.io.formats import stamp
 from whill_mjx.io.heartbeat import say
 from whill_mjx.learning.final_report import evaluate_drivers, write_report
@@ -61,6 +62,21 @@ def evaluate_policy(
             say(f"prediction.gif is left out: {error}. Install the base package to draw it.")
     return {**stamp("whill-mjx-evaluation"), "task": plain(preset.task), "learner": options.learner,
             "seed": options.seed, "env_steps": result.env_steps, "updates": result.updates, **summary}
+
+
+def outcome_line(evaluation: dict[str, Any]) -> str:
+    """Successes of the policy and of its baselines in the final evaluation."""
+    share, (low, high) = evaluation["policy"]["success"], evaluation["policy"]["success_interval_95"]
+    baselines = [name for name in ("planner", "random") if name in evaluation]
+    others = "".join(f", {name} {percent(evaluation[name]['success'])}" for name in baselines)
+    return f"success {percent(share)} (95% interval {percent(low)} to {percent(high)}){others}"
+
+
+def diverged_note(evaluation: dict[str, Any]) -> str:
+    """Why episodes of the policy ended as diverged; nothing where none did."""
+    share = evaluation["policy"]["diverged"]
+    why = "a reward, a sensor or the motion became not finite, or the vehicle turned over"
+    return f"; diverged: {percent(share)} of the episodes: {why}" if share else ""
 
 
 def export(options: TrainOptions, preset: Preset, vehicle: Path, result: Trained, path: Path) -> Path | None:

@@ -8,11 +8,13 @@ from dreamer.training import parallel
 from whill_mjx.batch import make_batch
 from whill_mjx.devices import choose_devices
 from whill_mjx.env import make_env
+from whill_mjx.io.command_line import OptionError
 from whill_mjx.learning.memory import check_memory
 from whill_mjx.learning.options import TrainOptions
 from whill_mjx.learning.setup import Preset, check_learner, variations_of
 from whill_mjx.learning.vehicle_of_run import spec_of_log
-from whill_mjx.tasks.check import check_world
+from whill_mjx.tasks.base import Task
+from whill_mjx.tasks.check import check_world, ending_names
 
 
 def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
@@ -26,6 +28,7 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         vehicle = spec_of_log(options.log)
     env, params = make_env(preset.task, vehicle, looks=preset.looks)
     check_world(env.task)  # of this vehicle, which a map may not have room for
+    check_stop_success(options.stop_success, env.task)
     check_memory(preset, options.learner, env)
     check_learner(preset, options.learner, make_batch(env, params, preset.instances))
     if any(text != "fit" for text in preset.vary):
@@ -42,3 +45,11 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
             import tensorboardX  # noqa: F401
         except ImportError:
             raise ValueError("--tensorboard: tensorboardX is missing. Install it or leave the option out.") from None
+
+
+def check_stop_success(share: float | None, task: Task) -> None:
+    """Raise OptionError for a share of successes where no episode can be one."""
+    names = () if share is None else ending_names(task)
+    if share is not None and "success" not in names:
+        raise OptionError(f"--stop-success {share:g}: task {task.name!r} has no ending 'success' (it has: "
+                          f"{', '.join(names)}). Leave the option out, or call one of the endings 'success'.")

@@ -136,6 +136,12 @@ def why_no_world(task: Task) -> str:
     return ""
 
 
+def ending_names(task: Task) -> tuple[str, ...]:
+    """Names of a task's own endings; ValueError where a method of it fails."""
+    world = check_world(task)
+    return tuple(_traced(task, "endings", _moment(_peopled(task, world) if task.people else world)))
+
+
 def _check_terms(task: Task, terms: Mapping[str, Any], ends: Mapping[str, Any]) -> None:
     """Refuse names that mean nothing: of terms that the rewards lack, and misspelt ones of endings that are counted."""
     if task.per_period is not Task.per_period:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,7 +12,7 @@ from typing import Any, ClassVar
 
 import jax
 
-from whill_mjx.io.fields import Field
+from whill_mjx.io.fields import Field, shown
 from whill_mjx.sensors.commands import Commands
 from whill_mjx.sensors.goal import Goal
 from whill_mjx.sensors.lidar import Lidar
@@ -19,7 +20,7 @@ from whill_mjx.tasks.base import Task, World
 from whill_mjx.vehicle.config import VehicleConfig
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.world.maps import GridMap, Reach, make_map_scene, map_scene_sampler, reach_of, read_map
-from whill_mjx.world.maps.places import farthest_move
+from whill_mjx.world.maps.places import NoRoom, farthest_move
 from whill_mjx.world.maps.several import MapGroup, side_by_side
 from whill_mjx.world.maps.ways import Ways, people_near
 from whill_mjx.world.people.crowd import Crowd, People
@@ -59,6 +60,14 @@ class MapGoal(Task):
     """Clearance at start and goal [m]; 0 takes what the vehicle needs to turn on the spot."""
     near: float = 0.0
     """Least distance from the vehicle's middle within which walls are met [m]; the size of the vehicle may raise it."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.map, os.PathLike):
+            object.__setattr__(self, "map", os.fspath(self.map))  # a path becomes its text
+        if not isinstance(self.map, str):
+            raise ValueError(f"task: map is {shown(self.map)}; it must be a path, or several in one text with commas "
+                             "between them. Give a file, or made:SEED for a floor plan of ours.")
+        super().__post_init__()
 
     def for_vehicle(self, spec: VehicleSpec) -> MapGoal:
         """With the clearances that a vehicle of this size needs, where the fields leave them open."""
@@ -112,10 +121,13 @@ def _made(paths: str, reach: Reach) -> MapGroup:
     for name, grid in zip(paths.split(","), _grids(paths), strict=True):
         try:
             scenes.append(make_map_scene(grid, reach))
+        except NoRoom as error:
+            raise ValueError(f"map {name.strip()}: {error} Where the map is right, lower the task's fields: passing is "
+                             f"{reach.passing:g} m (0 takes what the vehicle's body_width needs), standing "
+                             f"{reach.standing:g} m (0 takes what body_length and body_width need), and nearest "
+                             f"{reach.nearest:g} m.") from None  # fmt: skip
         except ValueError as error:
-            raise ValueError(f"map {name.strip()}: {error} The task's field passing is {reach.passing:g} m (0 takes "
-                             f"what the vehicle's body_width needs), and standing {reach.standing:g} m (0 takes what "
-                             "body_length and body_width need).") from None  # fmt: skip
+            raise ValueError(f"map {name.strip()}: {error}") from None
     return side_by_side(scenes)
 
 

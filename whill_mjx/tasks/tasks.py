@@ -16,6 +16,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -158,35 +159,46 @@ def _as_task(value: Any, where: str) -> Task:
 
 def _import(name: str, place: str) -> ModuleType:
     """Module of a dotted name or a file; whatever goes wrong in it becomes one line."""
+    is_file = place.endswith(".py")
     try:
-        if not place.endswith(".py"):
+        if not is_file:
             return importlib.import_module(place)
         path = Path(place).resolve()
-        if not path.is_file():
-            raise ValueError(f"task {name!r}: no such file {place}. Correct the path.")
-        version = hashlib.sha256(str(path).encode() + path.read_bytes())  # one that is edited is read anew
-        alias = f"task_{path.stem}_{version.hexdigest()[:8]}"
-        if alias not in sys.modules:
-            spec = importlib.util.spec_from_file_location(alias, path)
-            assert spec is not None and spec.loader is not None
-            module = importlib.util.module_from_spec(spec)
-            sys.modules[alias] = module  # dataclasses look their module up
-            try:
-                spec.loader.exec_module(module)
-            except BaseException:
-                del sys.modules[alias]
-                raise
-        return sys.modules[alias]
-    except ValueError:
-        raise
-    except ModuleNotFoundError as error:
-        if place.endswith(".py"):
-            raise ValueError(f"task {name!r}: {place} cannot be imported: {error}. Install it, or correct the "
-                             "file.") from error
-        raise ValueError(f"task {name!r}: {error}. Give package.module:TASK or path/to/file.py:TASK.") from error
+        if path.is_file():
+            return _import_file(path)
     except (Exception, SystemExit) as error:
-        raise ValueError(f"task {name!r}: {place} cannot be imported: {type(error).__name__}: {error}. Correct the "
-                         "file.") from error
+        text, missing = " ".join(str(error).split()).rstrip("."), isinstance(error, ModuleNotFoundError)
+        if missing and not is_file and f"{place}.".startswith(f"{error.name}."):  # type: ignore[union-attr]
+            raise ValueError(f"task {name!r}: {text}. Give package.module:TASK or path/to/file.py:TASK.") from error
+        text = text if missing else f"{type(error).__name__}: {text}"
+        remedy = "Install it, or correct the file." if missing else "Correct the file."
+        raise ValueError(f"task {name!r}: {place}{_line(place, error)} cannot be imported: {text}. {remedy}") from error
+    raise ValueError(f"task {name!r}: no such file {place}. Correct the path.")
+
+
+def _import_file(path: Path) -> ModuleType:
+    """Module of a file; one that is edited is read anew."""
+    version = hashlib.sha256(str(path).encode() + path.read_bytes())
+    alias = f"task_{path.stem}_{version.hexdigest()[:8]}"
+    if alias not in sys.modules:
+        spec = importlib.util.spec_from_file_location(alias, path)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[alias] = module  # dataclasses look their module up
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[alias]
+            raise
+    return sys.modules[alias]
+
+
+def _line(place: str, error: BaseException) -> str:
+    """Where in the file of a module its import failed."""
+    stem = f"/{place.replace('.', '/')}"
+    ends = (str(Path(place).resolve()),) if place.endswith(".py") else (f"{stem}.py", f"{stem}/__init__.py")
+    lines = [one.lineno for one in traceback.extract_tb(error.__traceback__) if one.filename.endswith(ends)]
+    return f", line {lines[-1]}:" if lines else ""
 
 
 TASKS: Registry[Task] = Registry(

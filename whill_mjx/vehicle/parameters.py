@@ -38,7 +38,14 @@ def get_values(params: VehicleParams, names: Sequence[str]) -> jax.Array:
 
 
 def set_values(params: VehicleParams, names: Sequence[str], values: jax.Array) -> VehicleParams:
-    """The same vehicle with the named parameters at `values` (P,), in their SI units."""
+    """The same vehicle with the named parameters at `values` (P,), in their SI units.
+
+    Raises:
+        KeyError: no such parameter; names the known ones.
+        ValueError: not one value for each name.
+    """
+    if len(values) != len(names):
+        raise ValueError(f"{len(names)} names of parameters and {len(values)} values: give one value for each name.")
     found = holders(params)
     for index, (holder, field) in enumerate(_split(found, names)):
         found[holder] = dataclasses.replace(found[holder], **{field: values[index]})

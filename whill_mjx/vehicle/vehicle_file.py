@@ -169,11 +169,10 @@ def _read(path: Path) -> dict[str, Any]:
                          f"sysid.fit DATASET --model {fields.in_shell(path)} --out RUN writes RUN/vehicle.toml "
                          "where a vehicle of the simulator drives alike.")
     content = read_toml(path, "no such vehicle file. Make one with `python -m sysid.fit DATASET --out RUN`.",
-                        "Vehicle files are written by sysid.fit.")
+                        "Correct the line.")
     content = upgraded(KIND, content)
     if content.get("kind") == KIND and content.get("schema") != SCHEMA:
-        raise ValueError(f"{path}: schema is {fields.shown(content.get('schema'))}; this version reads schema {SCHEMA}."
-                         " Fit the vehicle again.")
+        raise ValueError(f"{path}: {_wrong_schema(content.get('schema'))}")
     if content.get("kind") != KIND:
         raise ValueError(f"{path}: kind is {fields.shown(content.get('kind'))}, not {KIND!r}. Give a vehicle file.")
     table = fields.check_table(str(path), fields.VEHICLE, content, remedy=NEWER)
@@ -182,6 +181,16 @@ def _read(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: has {' and '.join(parts)}; it must have both body and effects and no base, or "
                          "neither of the two. Correct it.")
     return table
+
+
+def _wrong_schema(schema: Any) -> str:
+    """What is wrong with the number of a vehicle file's format, and the remedy."""
+    if schema is None:
+        return f"has no schema, the number of the file's format. Add schema = {SCHEMA} at its top."
+    found = f"schema is {fields.shown(schema)}; this version reads schema {SCHEMA}."
+    if isinstance(schema, int) and schema > SCHEMA:
+        return f"{found} A newer version wrote the file. Use that version; by hand, write schema = {SCHEMA}."
+    return f"{found} Write schema = {SCHEMA}."
 
 
 def _read_spec(path: Path, table: dict[str, Any]) -> VehicleSpec:
@@ -200,7 +209,7 @@ def _read_spec(path: Path, table: dict[str, Any]) -> VehicleSpec:
 
 
 def _check_sizes(path: Path, spec: VehicleSpec) -> None:
-    """Refuse a body that does not reach to its wheels."""
+    """Refuse a body that does not reach to its wheels, or is lower than they are."""
     farthest = max(abs(spec.rear_x), abs(spec.front_x))
     if farthest > spec.body_length / 2 + spec.wheel_radius:
         raise ValueError(f"{path}: spec.wheelbase {spec.wheelbase:g} m and the rear axle at {spec.rear_x:g} m put an "
@@ -209,6 +218,10 @@ def _check_sizes(path: Path, spec: VehicleSpec) -> None:
     if spec.track > spec.body_width:
         raise ValueError(f"{path}: spec.track is {spec.track:g} m and spec.body_width {spec.body_width:g} m; the body "
                          "is as wide as its wheels at least. Correct one.")
+    if 2 * spec.wheel_radius > spec.body_height:
+        raise ValueError(f"{path}: spec.wheel_radius is {spec.wheel_radius:g} m and spec.body_height "
+                         f"{spec.body_height:g} m; the body is as high as its wheels at least, twice their radius. "
+                         "Correct wheel_radius, or body_height, the overall height.")
 
 
 def _effect_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:

@@ -17,7 +17,7 @@ from flax import struct
 
 from whill_mjx.world.materials import Finish
 from whill_mjx.world.people.crowd import People
-from whill_mjx.world.solids import Solids
+from whill_mjx.world.solids import Solids, check_sizes
 
 BLUE = (0.04, 0.16, 0.90)
 """Of every goal marker."""
@@ -155,7 +155,12 @@ def stack_boxes(boxes: list[Boxes]) -> Boxes:
 
 
 def box(x, y, length, width, height, colour, yaw=0.0, mask=True) -> Boxes:
-    """One box standing on the ground, centred at (x, y); `length` runs along its own x. A `Boxes` with P = 1."""
+    """One box standing on the ground, centred at (x, y); `length` runs along its own x. A `Boxes` with P = 1.
+
+    Raises:
+        ValueError: a size that is no number above 0; sizes that are traced are taken as they come.
+    """
+    check_sizes(length=length, width=width, height=height)
     centre = jnp.stack([jnp.asarray(value, jnp.float32) for value in (x, y, height / 2)])
     half = jnp.stack([jnp.asarray(value, jnp.float32) / 2 for value in (length, width, height)])
     return Boxes(

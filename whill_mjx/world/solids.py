@@ -5,6 +5,9 @@ All are of fixed number.
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -65,8 +68,16 @@ def rod(start, end, radius, colour, capsule: bool = True) -> Rounds:
     )
 
 
+def check_sizes(**sizes: Any) -> None:
+    """Raise ValueError for sizes in plain numbers that are not above 0 and finite."""
+    for name, size in sizes.items():
+        if isinstance(size, int | float) and not 0.0 < size < math.inf:
+            raise ValueError(f"{name} is {size:g} m; it must be above 0 and finite, or a thing is hit where it is not.")
+
+
 def post(x, y, height, radius, colour) -> Rounds:
-    """One cylinder standing on the ground."""
+    """One cylinder standing on the ground; ValueError for a size in plain numbers that is not above 0."""
+    check_sizes(height=height, radius=radius)
     x, y, height = (jnp.asarray(value, jnp.float32) for value in (x, y, height))
     return rod(jnp.stack([x, y, 0.0 * height]), jnp.stack([x, y, height]), radius, colour, capsule=False)
 

@@ -14,7 +14,7 @@ from sysid.logs.tables.decisions import decide, decisions_of, first_of, unused_c
 from sysid.logs.tables.guess import guess, shown_units
 from sysid.logs.tables.sizes import TURNED
 from sysid.logs.tables.streams import as_odometry, as_twist, backward_wheel, dead_reckoned, stream_rows, with_rates
-from sysid.logs.tables.text_table import read_table, text_files
+from sysid.logs.tables.text_table import read_table, text_files, unreadable
 
 LEAST_OF: dict[str, list[tuple[str, ...]]] = {
     "command": [("v",), ("left", "right")], "odometry": [("v", "omega"), ("x", "y", "yaw")],
@@ -45,6 +45,8 @@ def read_drives(
         wheels: take measured wheel speeds as the input, and leave commands out.
     """
     groups, refused = list[tuple[str, list[Table]]](), list[ValueError]()
+    for path in unreadable(source):
+        refused.append(ValueError(f"{path}: no file that can be read: a broken link, a pipe or a device."))
     for files in text_files(source):
         found = []
         for path in files:

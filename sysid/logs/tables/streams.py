@@ -83,7 +83,10 @@ def _rows_of_file(
         found = {key: values[sent] if key == "t" else _held(values[sent]) for key, values in found.items()}
     whole = np.isfinite(list(found.values())).all(axis=0)
     found = {key: values[whole] for key, values in found.items()}
+    found, unset = _with_orientation(found)
     notes = _check_clock(file, found["t"])
+    if unset:
+        notes.append(f"{file}: {counted(unset, 'row')} of {stream} with an orientation that is all zero left out")
     order = np.argsort(found["t"], kind="stable")
     if (spread := _spread(found["t"][order])) is not None:
         step = float(np.median(np.diff(np.unique(found["t"]))))
@@ -108,6 +111,15 @@ def _rows_of_file(
     if "yaw" in found:
         found["yaw"] = np.unwrap(found["yaw"])
     return found, notes
+
+
+def _with_orientation(found: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
+    """The rows (T,) without those whose quaternion is all zero, unless all are, and how many these were."""
+    parts = [found[name] for name in ("qx", "qy", "qz", "qw") if name in found]
+    known = np.any(parts, axis=0) if "qw" in found else np.ones(len(found["t"]), bool)
+    if not known.any():
+        return found, 0
+    return {key: values[known] for key, values in found.items()}, int((~known).sum())
 
 
 def _held(values: np.ndarray) -> np.ndarray:

@@ -45,6 +45,12 @@ def text_files(source: Path) -> list[list[Path]]:
     return [files]
 
 
+def unreadable(source: Path) -> list[Path]:
+    """What has the name of a text file in a folder and is neither a file nor a folder."""
+    inside = sorted(source.iterdir()) if source.is_dir() else []
+    return [path for path in inside if path.suffix.lower() in SUFFIXES and not path.is_file() and not path.is_dir()]
+
+
 def read_table(path: Path) -> Table:
     """The numbers of a text file by column; comments and blank lines are left out, empty cells are nan."""
     text = read_text(path, CSV_BYTES, "no such file.")

@@ -22,6 +22,7 @@ XML_BYTES = 60 * MB
 MARGIN = 10.0
 """Free ground around all footprints [m]."""
 MAX_CELLS = 50 * MB
+REMEDY = "Take smaller cells (--cell of python -m whill_mjx.maps)."
 
 
 def load_footprints(path: str | Path, resolution: float = 0.1, scale: float = 1.0) -> GridMap:
@@ -51,7 +52,7 @@ def load_footprints(path: str | Path, resolution: float = 0.1, scale: float = 1.
         cells, origin = _drawn(outlines, resolution)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    return GridMap(cells, resolution, origin, shift=shift, notes=tuple(notes))
+    return GridMap(cells, resolution, origin, shift=shift, notes=tuple(notes), remedy=REMEDY)
 
 
 def _outlines(root: ET.Element, scale: float) -> tuple[list[list[np.ndarray]], tuple[float, float], list[str]]:

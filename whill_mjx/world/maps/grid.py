@@ -34,6 +34,8 @@ class GridMap:
     """Whole metres x, y that were taken off the file's coordinates; added to a place, they give the file's own."""
     notes: tuple[str, ...] = ()
     """How the file's coordinates were understood, and what of it is left out."""
+    remedy: str = "Check the resolution."
+    """What to do about the map where a vehicle finds no room in it; it depends on the kind of the file."""
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
         """World coordinates (..., 2) of points (..., 2) in the grid's own frame [m]."""

@@ -35,7 +35,7 @@ def made_plan(seed: int) -> GridMap:
     cells[WALL : rows - WALL, WALL : columns - WALL] = FREE
     for room in list(_divided(cells, whole, rng)):
         _furnish(cells, room, rng)
-    return GridMap(cells, CELL, (0.0, 0.0, 0.0))
+    return GridMap(cells, CELL, (0.0, 0.0, 0.0), remedy="Take another seed.")
 
 
 def _divided(cells: np.ndarray, room: Room, rng: np.random.Generator) -> Iterator[Room]:

@@ -18,6 +18,8 @@ from whill_mjx.io.reading import MB, read_text
 from whill_mjx.world.maps.grid import FREE, OCCUPIED, UNKNOWN, GridMap
 from whill_mjx.world.maps.images import read_levels
 
+NAV2 = (".yaml", ".yml")
+"""Endings of nav2 maps."""
 YAML_BYTES = MB // 100  # a map file has 0.2 kB
 REAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 LEVELS = np.array([254, 128, 0], np.uint8)
@@ -29,9 +31,13 @@ def load_map(path: str | Path) -> GridMap:
     """Occupancy grid of a map_server YAML file; one that lies far from zero is moved there (`GridMap.shift`).
 
     Raises:
-        ValueError: a field is missing or out of its range, or the image cannot be read; names file and remedy.
+        ValueError: another ending, a field is missing or out of its range, or the image cannot be read; names file and
+            remedy.
     """
     path = Path(path)
+    if path.suffix.lower() not in NAV2:
+        raise ValueError(f"{path}: load_map reads only nav2 maps ({', '.join(NAV2)}). Read other kinds with read_map, "
+                         "or make them nav2 maps with python -m whill_mjx.maps.")
     table = check_table(str(path), MAP, read_map_yaml(path))
     occupied, free = table["occupied_thresh"], table["free_thresh"]
     if not free < occupied:
@@ -47,7 +53,8 @@ def load_map(path: str | Path) -> GridMap:
     kinds = occupancy_kinds(occupied, free, raw=mode == "raw")
     x, y, yaw = table["origin"]
     occupancy = occupancy[::-1].copy()  # the last row of the image lies at the bottom
-    return GridMap(kinds[occupancy], table["resolution"], (x, y, yaw), occupancy).brought_near()
+    remedy = "Check the resolution and the thresholds."
+    return GridMap(kinds[occupancy], table["resolution"], (x, y, yaw), occupancy, remedy=remedy).brought_near()
 
 
 def as_nav2(grid: GridMap, image: str) -> tuple[str, bytes]:

@@ -21,6 +21,10 @@ SEEN = 0.63
 """Distance from its border at which a vehicle notices walls at least [m]."""
 
 
+class NoRoom(ValueError):
+    """A vehicle finds no room in a map: the map is wrong, or too much is asked of it."""
+
+
 @dataclass(frozen=True)
 class Reach:
     """What a vehicle needs of a map [m]; the defaults are a WHILL Model CR's, `reach_of` gives those of others."""
@@ -120,7 +124,7 @@ def draw_places(
     """Pairs with a way of the asked length between them: `each` starts for each of `goals` goals.
 
     Raises:
-        ValueError: the map has no such pair; names the largest clearance and the length of the longest way.
+        NoRoom: the map has no such pair; names the largest clearance and the length of the longest way.
     """
     from scipy.sparse.csgraph import dijkstra
 
@@ -147,9 +151,9 @@ def draw_places(
         ends.append(np.repeat(points[goal][None], each, 0))
         ways.append(distance[chosen])
     if not starts:
-        raise ValueError(
+        raise NoRoom(
             f"the map has no start and goal {reach.nearest:g} to {reach.farthest:g} m apart: its widest place has "
             f"{clear.max():.2f} m of clearance where {reach.standing:g} m are needed, its longest way is "
-            f"{longest:.1f} m. Ask for less, or check the scale."
+            f"{longest:.1f} m. {grid.remedy}"
         )
     return Places(np.concatenate(starts), np.concatenate(ends), np.concatenate(ways))

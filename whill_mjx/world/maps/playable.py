@@ -15,8 +15,8 @@ import numpy as np
 from whill_mjx.world.maps.footprints import load_footprints
 from whill_mjx.world.maps.grid import FARTHEST, GridMap
 from whill_mjx.world.maps.made import made_plan
-from whill_mjx.world.maps.nav2 import load_map
-from whill_mjx.world.maps.places import Places, Reach, clearances, draw_places
+from whill_mjx.world.maps.nav2 import NAV2, load_map
+from whill_mjx.world.maps.places import NoRoom, Places, Reach, clearances, draw_places
 from whill_mjx.world.maps.straight import connected, open_space, straight_walls
 from whill_mjx.world.maps.surfaces import CLOUDS, MESHES, load_surfaces
 from whill_mjx.world.maps.walls import SHOWN, map_walls
@@ -50,18 +50,28 @@ def read_map(path: str | Path, cell: float = 0.1, scale: float = 1.0) -> GridMap
 
 
 def _read(path: str | Path, cell: float, scale: float) -> GridMap:
-    made, _, seed = str(path).partition("made:")
-    if not made and seed.isdecimal():
-        return made_plan(int(seed))
+    if (seed := _seed(path)) is not None:
+        return made_plan(seed)
     ending = Path(path).suffix.lower()
     if ending in (*CLOUDS, *MESHES):
         return load_surfaces(path, cell, scale)
     if ending in (".osm", ".gml", ".xml"):
         return load_footprints(path, cell, scale)
-    if ending in (".yaml", ".yml"):
+    if ending in NAV2:
         return load_map(path)
     raise ValueError(f"{path}: unknown kind of map (known: .yaml of nav2, .osm, .gml, "
                      f"{', '.join(dict.fromkeys((*CLOUDS, *MESHES)))}). Give one of them, or made:SEED.")
+
+
+def _seed(path: str | Path) -> int | None:
+    """Seed of a floor plan of ours; None for a file."""
+    made, _, seed = str(path).partition("made:")
+    return int(seed) if not made and seed.isdecimal() else None
+
+
+def has_cells(path: str | Path) -> bool:
+    """Whether a map comes with cells of its own: `cell` and `scale` of `read_map` have no effect on it."""
+    return _seed(path) is not None or Path(path).suffix.lower() in NAV2
 
 
 def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN, seed: int = 0) -> MapScene:
@@ -74,7 +84,8 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN,
         seed: of the places.
 
     Raises:
-        ValueError: it reaches too far from zero, no place is wide enough, or no two are the asked distance apart.
+        ValueError: it reaches too far from zero.
+        NoRoom: no place is wide enough, or no two are the asked distance apart.
     """
     reach = reach or Reach()
     if (far := grid.farthest()) > FARTHEST:
@@ -85,9 +96,9 @@ def make_map_scene(grid: GridMap, reach: Reach | None = None, keep: int = SHOWN,
     clear = clearances(space, grid.resolution)
     space = connected(space, clear >= reach.passing)
     if not space.any():
-        raise ValueError(
+        raise NoRoom(
             f"the map's widest place has {clear.max():.2f} m of clearance, and the vehicle needs "
-            f"{reach.passing:g} m. Check the resolution and the thresholds."
+            f"{reach.passing:g} m. {grid.remedy}"
         )
     places = draw_places(grid, space, reach, seed=seed)
     return MapScene(grid, space, map_walls(straight_walls(grid, space), keep, near=reach.near), places)

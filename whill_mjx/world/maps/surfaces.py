@@ -7,6 +7,8 @@ UNKNOWN elsewhere. The floor is level. z points up, except in glTF, whose y does
 from __future__ import annotations
 
 import io
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +34,13 @@ MARGIN = 0.5
 CONVERT = ("If it is not in metres, run python -m whill_mjx.maps {} --scale 0.001 --out NAME (0.001 for millimetres) "
            "and take NAME.yaml as the map.")
 """What to do about a file in another unit. Tasks read metres; the command writes a map that they read."""
+REMEDY = "Check the unit, and take smaller cells (--scale and --cell of python -m whill_mjx.maps)."
+"""What to do where a vehicle finds no room."""
 TYPES = {("F", 4): "f4", ("F", 8): "f8", ("U", 1): "u1", ("U", 2): "u2", ("U", 4): "u4", ("I", 1): "i1", ("I", 2): "i2",
          ("I", 4): "i4", ("U", 8): "u8", ("I", 8): "i8"}  # fmt: skip
+
+ZERO_CORNER = re.compile(rb"^f[ \t](?:[^#\n]*[ \t])?[+-]?0+(?:[/\s]|\Z)", re.MULTILINE)
+"""A face of an .obj file, one of whose corners is 0."""
 
 
 def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0) -> GridMap:
@@ -82,13 +89,14 @@ def load_surfaces(path: str | Path, resolution: float = 0.1, scale: float = 1.0)
     cells = np.full((rows, columns), UNKNOWN, np.uint8)
     cells[floor] = FREE
     cells[solid] = OCCUPIED
-    return GridMap(cells, resolution, (float(low[0]), float(low[1]), 0.0)).brought_near()
+    return GridMap(cells, resolution, (float(low[0]), float(low[1]), 0.0), remedy=REMEDY).brought_near()
 
 
 def _npy(data: bytes) -> tuple[np.ndarray, None]:
     array = np.load(io.BytesIO(data), allow_pickle=False)
-    if array.ndim != 2 or array.shape[1] < 3 or not np.issubdtype(array.dtype, np.number):
-        raise ValueError(f"an array of {array.dtype} of shape {array.shape}; (N, 3) numbers are needed")
+    real = np.issubdtype(array.dtype, np.integer) or np.issubdtype(array.dtype, np.floating)
+    if array.ndim != 2 or array.shape[1] < 3 or not real:
+        raise ValueError(f"an array of {array.dtype} of shape {array.shape}; (N, 3) real numbers are needed")
     return array, None
 
 
@@ -97,6 +105,7 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
     import trimesh
 
     kind = path.suffix.lower()[1:]
+    _check_content(kind, data)
     # A .gltf and an .obj name other files beside them.
     if kind in ("gltf", "obj"):
         loaded: Any = trimesh.load(path, process=False)
@@ -114,6 +123,17 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
         points = points[:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
     faces = getattr(loaded, "faces", None)
     return points, None if faces is None or not len(faces) else np.asarray(faces)
+
+
+def _check_content(kind: str, data: bytes) -> None:
+    """ValueError for what trimesh accepts, or refuses for a misleading reason."""
+    counted, there = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
+    if kind == "stl" and b"\0" in data and counted > there:  # text has no zero bytes
+        raise ValueError(f"it is cut short: its header counts {counted} triangles, and {max(there, 0)} are there")
+    if kind == "obj" and ZERO_CORNER.search(data):
+        raise ValueError("a face has the corner 0, and the corners begin at 1")
+    if kind == "gltf":
+        json.loads(data)
 
 
 def _check_corners(shape: tuple[int, ...], faces: Any) -> None:
@@ -137,7 +157,12 @@ def _pcd(data: bytes) -> tuple[np.ndarray, None]:
         if words and not words[0].startswith("#"):
             header[words[0]] = words[1:]
     counts = [int(word) for word in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
-    kinds = [TYPES[kind, int(size)] for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    types = list(zip(header["TYPE"], map(int, header["SIZE"]), strict=True))
+    for kind, size in types:
+        if (kind, size) not in TYPES:
+            known = ", ".join(f"{letter} {number}" for letter, number in TYPES)
+            raise ValueError(f"a field has the type {kind} and the size {size} (known: {known})")
+    kinds = [TYPES[one] for one in types]
     number = int(header["POINTS"][0])
     if not 0 <= number <= MOST_POINTS:
         raise ValueError(f"it announces {number} points")
