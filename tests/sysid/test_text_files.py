@@ -859,3 +859,53 @@ def test_of_seconds_since_1970_one_a_second_is_no_millisecond():
     t = 1.7e9 + np.arange(0.0, 3000.0, 1.0)
     (time, *_) = guess([Table("drive", {"t": t, "cmd_v": 0 * t, "cmd_w": 0 * t})])
     assert time.sure and time.unit == "s"
+
+
+def test_rows_whose_quaternion_is_all_zero_are_left_out_and_counted(tmp_path):
+    c = columns()
+    turned = quaternion(c["gyaw"])
+    lost = np.arange(len(c["t"])) % 50 == 7
+    table = {"t": c["t"], "cmd_v": c["cv"], "cmd_omega": c["cw"], "odom_x": c["x"], "odom_y": c["y"],
+             "odom_yaw": c["yaw"], "odom_v": c["v"], "odom_omega": c["w"], "gt_x": c["gx"], "gt_y": c["gy"],
+             **{f"gt_{name}": np.where(lost, 0.0, one) for name, one in turned.items()}}
+    log, notes = convert(ConvertConfig(write(tmp_path / "drive.csv", table), tmp_path / "out"))
+    assert any(f"{lost.sum()} rows of ground_truth with an orientation that is all zero left out" in one
+               for one in notes)
+    pose = log.trials[0].ground_truth
+    np.testing.assert_allclose(pose.yaw, np.interp(pose.t, DRIVE.ground_truth.t, DRIVE.ground_truth.yaw), atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["...csv", ".hidden.csv"])
+def test_a_trial_is_no_hidden_folder(tmp_path, name):
+    log, _ = convert(ConvertConfig(write(tmp_path / "in" / name, columns_by_name()), tmp_path / "out"))
+    assert [trial.name[0] for trial in log.trials] == [log.trials[0].name[0]] and log.trials[0].name[0] != "."
+    (tmp_path / "out" / "trials" / ".ipynb_checkpoints").mkdir()
+    assert load_log(tmp_path / "out").trials[0].name == log.trials[0].name
+
+
+def columns_by_name():
+    c = columns()
+    names = {"t": "t", "cv": "cmd_v", "cw": "cmd_omega", "x": "odom_x", "y": "odom_y", "yaw": "odom_yaw", "v": "odom_v",
+             "w": "odom_omega", "gx": "gt_x", "gy": "gt_y", "gyaw": "gt_yaw"}
+    return {names[key]: one for key, one in c.items()}
+
+
+def test_a_stamp_is_asked_of_bags_alone(tmp_path):
+    with pytest.raises(ValueError, match="--stamp header: rows of tables have one time each"):
+        convert(ConvertConfig(write(tmp_path / "drive.csv", columns_by_name()), tmp_path / "out", stamp="header"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_broken_link_is_left_out_by_name(tmp_path):
+    write(tmp_path / "in" / "a.csv", columns_by_name())
+    (tmp_path / "in" / "b.csv").symlink_to(tmp_path / "nowhere.csv")
+    _, notes = convert(ConvertConfig(tmp_path / "in", tmp_path / "out"))
+    assert any("b.csv: no file that can be read" in one for one in notes)
+
+
+@pytest.mark.parametrize(("begin", "kind"), [(b"\x1f\x8b\x08", "a gzip archive"), (b"PAR1\x15", "a Parquet file"),
+                                             (b"\x89MCAP0\r\n", "an MCAP recording")])
+def test_what_is_no_text_is_called_what_it_is(tmp_path, begin, kind):
+    (tmp_path / "drive.csv").write_bytes(begin + bytes(range(200)))
+    with pytest.raises(ValueError, match=f"drive.csv: is {kind}, whatever its name says"):
+        read_table(tmp_path / "drive.csv")
