@@ -66,9 +66,9 @@ CLAIMS = (
         "Logs of an independent contact plant. 26 effects of the catalogue, most with another law, and 8 beyond "
         "it. 1x is the "
         'size that 80 % of all logs would notice. "Right": the name or a member of its class. The columns "fresh" are '
-        "of logs that nobody had seen (draws 233 to 235); six of them have backlash, which is never named. Since then a "
-        "contradicted set of effects makes room for the next one; this is not yet in the figures. Columns 2x and 4x are of an earlier decision, on logs that its weights were chosen with; the "
-        "others are older still.",
+        "of logs that nobody had seen (draws 233 to 235); six of them have backlash, which is never named. Since then "
+        "a contradicted set of effects makes room for the next one; this is not yet in the figures. Columns 2x and 4x "
+        "are of an earlier decision, on logs that its weights were chosen with; the others are older still.",
         ("figure", "2x, fresh", "4x, fresh", "2x", "4x", "2x, noise x2", "4x, noise x2", "4x, heavy scooter"),
         tuple(
             (
