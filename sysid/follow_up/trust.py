@@ -22,7 +22,8 @@ UNDONE = 0.5  # what two effects change together, as a share of what each does, 
 def contradicted(result: Result) -> list[str]:
     """What speaks against effects that would else have been named."""
     if result.search.findings is not None:
-        return [each for against in result.search.findings.against.values() for each in against]
+        return [f"{names.replace('+', ' and ')}: {each}" for names, against in result.search.findings.against.items()
+                for each in against]
     if result.search.verdict == "named":
         return []
     return [each for one in result.stood for each in one.against(result.config.thresholds)]

@@ -171,7 +171,8 @@ def faults(log: Log, responses: Responses | None = None) -> list[str]:
         if ratios and not 0.3 < np.median(ratios) < 3.0:
             found.append(f"{channel}: the path is {np.median(ratios):.2g} times as long as the commands ask for: x and "
                          "y must be in metres, of the reference point.")
-    found += [*odd_trials(trials), *short_timeout(trials, log.fields.get("command_timeout")), *time_faults(trials)]
+    found += odd_trials(trials, [channel for channel in CHANNELS if not contradicted[channel]])
+    found += [*short_timeout(trials, log.fields.get("command_timeout")), *time_faults(trials)]
     gone = () if contradicted["ground_truth"] else lost(log)
     if gone:
         found.append(f"ground_truth: in {len(gone)} of {len(trials)} trials ({gone[0]}, ...) its yaw contradicts the "

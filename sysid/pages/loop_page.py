@@ -70,7 +70,7 @@ def found(report: dict[str, Any]) -> str:
     if text := report["noise_sentence"]:
         parts.append(paragraph(f"{text[0].upper()}{text[1:]}."))
     if report["contradicted"]:
-        parts += [paragraph("Contradicted, and so not named:"), bullets(report["contradicted"])]
+        parts += [paragraph("Withdrawn, since the drives contradict them:"), bullets(report["contradicted"])]
     if report["shown"] is not None:
         names = vehicles(report)
         parts += [heading("One drive, before and after"), drive_pictures(report["shown"], names),

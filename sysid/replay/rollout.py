@@ -224,7 +224,7 @@ class _Programs:
             spare = jnp.zeros((room - len(command), *command.shape[1:]), command.dtype)
             return state, jnp.concatenate([command, spare])
 
-        def drive(values: jax.Array, state: Any, command: jax.Array, count: jax.Array) -> jax.Array:
+        def drive(values: jax.Array, state: Any, command: jax.Array, count: jax.Array, own: jax.Array) -> jax.Array:
             vehicle, _ = delay_apart(own_effects(plant, set_values(values)))
             first = plant.observe(state)
             path = jnp.concatenate([first[None], jnp.zeros((len(command), len(first)), first.dtype)])
@@ -238,7 +238,7 @@ class _Programs:
                 return jax.lax.fori_loop(0, count, after, (state, path))[1]
 
             path = in_one(steps)(state, path, count)
-            return jnp.where(jnp.arange(len(path))[:, None] > count, path[count], path)  # it stays where it ended
+            return jnp.where(jnp.arange(len(path))[:, None] > own, path[own], path)  # it stays where it ended
 
         def finish(values: jax.Array, path: jax.Array, command: jax.Array, start: jax.Array, gyro: bool) -> jax.Array:
             params = set_values(values)
@@ -246,7 +246,7 @@ class _Programs:
             return as_sensed(plant, params, commanded, path[: len(command) + 1], gyro)
 
         self._begin = Compiled(jax.vmap(begin, in_axes=(0, 0, 0, None)), static=1)
-        self._drive = Compiled(jax.vmap(drive, in_axes=(0, 0, 0, None)))
+        self._drive = Compiled(jax.vmap(drive, in_axes=(0, 0, 0, None, 0)))
         self._finish = Compiled(jax.vmap(finish, in_axes=(0, 0, 0, 0, None)), static=1)
         self._observe = jax.vmap(plant.observe)
 
@@ -255,17 +255,18 @@ class _Programs:
         state, held = self._begin.shapes(values, command, start, warm_up)
         seen = jax.eval_shape(self._observe, state)
         path = jax.ShapeDtypeStruct((held.shape[0], held.shape[1] + 1, seen.shape[1]), seen.dtype)
-        self._drive.compile(values, state, held, jax.ShapeDtypeStruct((), jnp.int32))
+        counts = (jax.ShapeDtypeStruct(shape, jnp.int32) for shape in ((), held.shape[:1]))
+        self._drive.compile(values, state, held, *counts)
         self._finish.compile(values, path, command, start, gyro)
         self._begin.compile(values, command, start, warm_up)
 
     def __call__(
-        self, values: np.ndarray, command: np.ndarray, start: np.ndarray, warm_up: int, gyro: bool, records: int
+        self, values: np.ndarray, command: np.ndarray, start: np.ndarray, warm_up: int, gyro: bool, records: np.ndarray
     ) -> Any:
-        """Paths (N, R + 1, C) of sets (N, P) and drives with commands (N, R, K, 2) from starts (N, 5); all stay where
-        they are after so many records."""
+        """Paths (N, R + 1, C) of sets (N, P) and drives with commands (N, R, K, 2) from starts (N, 5), each of which
+        ends after its number of `records` (N,) and stays there."""
         state, held = self._begin(values, command, start, warm_up)
-        path = self._drive(values, state, held, np.int32(records))
+        path = self._drive(values, state, held, records.max(), records)
         return self._finish(values, path, command, start, gyro)
 
 
@@ -322,7 +323,7 @@ class PathReplay:
         return np.concatenate([np.asarray(paths) for paths in begun])[:count]
 
     def _on_cores(self, values: np.ndarray, batch: Batch, trials: np.ndarray, records: np.ndarray | None) -> np.ndarray:
-        """As a call, on a processor: the longest drives first, as many at once as one program takes."""
+        """Replay on a processor: the longest drives first, as many at once as one program takes."""
         values = values.astype(jnp.result_type(float))
         command, start = np.asarray(batch.command), np.asarray(batch.start)
         longest, gyro = command.shape[1], batch.gyro_index is not None
@@ -335,7 +336,7 @@ class PathReplay:
             mine = order[first : first + self.rows]
             filled = _filled(mine, self.rows - len(mine))
             found = self._run(values[filled], command[trials[filled]], start[trials[filled]], batch.warm_up, gyro,
-                              int(needed[mine[0]]))
+                              needed[filled].astype(np.int32))
             return np.asarray(found)[: len(mine)]
 
         firsts = range(0, len(values), self.rows)

@@ -84,6 +84,8 @@ def find_missing(
         found = stand(outcome, seen.refitter, log.training, seen.evidence.groups, log.spec.track, p_excess)
         stood[outcome.effects] = tuple(found)
         outcome = guarded(outcome, found, config.thresholds)
+        if nulls is not None:
+            outcome = checked(outcome, nulls, seen.ready.wander, config.thresholds)
     seconds = {"reference": fitted - began, "signatures": gathered - fitted, "search": searched - gathered,
                "null_refits": time.perf_counter() - searched}
     floor = floor_change(reference, log.training, config.thresholds.alpha)

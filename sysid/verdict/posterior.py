@@ -185,7 +185,7 @@ class Posterior:
     """What the findings come to."""
 
     verdict: str
-    chosen: int | None  # number of the set that explains most; of `Findings.sets`
+    chosen: int | None  # number of the set that is named, or else explains most; of `Findings.sets`
     share: float  # that it explains of what can be explained
     reason: str
     weights: dict[str, float]  # of `none` or `noise`, `unknown` and sets of effects (joined by " + "): 1 in all

@@ -70,14 +70,16 @@ class Search:
         return self
 
     def _accept(self, chosen: Weighed, findings: Findings) -> None:
+        """Take a set of effects for what the verdict is about."""
         self.accepted, self.together = list(chosen.members), chosen.together
         self.final = chosen.members[-1].refit
         self.excess = self.excess[0], chosen.numbers.left.excess
         for one in chosen.members:
             if not any(each is one for listed in self.rounds for each in listed):
                 self.rounds.append([one])
-        alone = {names for names, against in findings.against.items() if against}
-        classes = [[name for name in members if name == members[0] or name not in alone]
+        withdrawn = [{*names.split("+")} for names, against in findings.against.items() if against]
+        classes = [[name for name in members
+                    if name == members[0] or {*self.effects} - {members[0]} | {name} not in withdrawn]
                    for members in chosen.numbers.apart()]
         self.classes = [members[:LARGEST] for members in classes]
         self.crowd = [name for members in classes for name in members[LARGEST:]]

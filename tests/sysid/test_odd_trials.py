@@ -9,6 +9,7 @@ import pytest
 
 from sysid.logs.coverage import faults
 from sysid.logs.log import load_log
+from sysid.logs.odd_trials import odd_trials
 from sysid.logs.records import Command
 
 pytestmark = pytest.mark.quick
@@ -38,15 +39,33 @@ def test_a_pose_that_is_late_in_one_trial_is_named_with_it(chair, name, seconds,
 def test_the_pose_of_another_trial_is_named(chair):
     pose = next(one for one in chair.trials if one.name == "circle_1").ground_truth
     [found] = faults(changed(chair, "random_1", ground_truth=pose))
-    assert "in random_1 the outside pose does not follow the odometry" in found
+    assert "in random_1 the outside pose does not turn with the odometry" in found
 
 
 def test_a_drive_without_commands_is_named_with_its_way(chair):
     random = next(one for one in chair.trials if one.name == "random_1")
     still = Command(random.command.t, *np.zeros((2, len(random.command.t))))
     [found] = faults(changed(chair, "random_1", command=still))
-    way = float(np.trapezoid(np.abs(random.odometry.v), random.odometry.t))
+    way = float(np.hypot(np.ptp(random.ground_truth.x), np.ptp(random.ground_truth.y)))
     assert found.startswith(f"command: in random_1 all commands are zero while the vehicle moves {way:.1f} m")
+
+
+def test_noise_at_rest_is_no_drive_and_two_trials_at_rest_are_no_copies(chair):
+    first, random = chair.trials[0], np.random.default_rng(0)
+    command = Command(first.command.t, *np.zeros((2, len(first.command.t))))
+    pose = first.ground_truth
+    noisy = replace(pose, x=random.normal(0, 0.01, len(pose.t)), y=random.normal(0, 0.01, len(pose.t)),
+                    yaw=random.normal(0, 0.02, len(pose.t)))
+    odometry = replace(first.odometry, **dict.fromkeys(("x", "y", "yaw", "v", "omega"), 0 * first.odometry.v))
+    rest = replace(first, command=command, ground_truth=noisy, odometry=odometry)
+    assert odd_trials((*chair.trials, replace(rest, name="one"), replace(rest, name="two"))) == []
+
+
+def test_straight_drives_with_a_noisy_pose_are_of_their_own_log(chair):
+    random = np.random.default_rng(0)
+    trials = [replace(one, ground_truth=replace(one.ground_truth, yaw=one.ground_truth.yaw + random.normal(
+        0, 0.02, len(one.ground_truth.t)))) for one in chair.trials]
+    assert odd_trials(trials) == []
 
 
 def test_a_copy_is_no_replicate(chair):

@@ -909,3 +909,5 @@ def test_what_is_no_text_is_called_what_it_is(tmp_path, begin, kind):
     (tmp_path / "drive.csv").write_bytes(begin + bytes(range(200)))
     with pytest.raises(ValueError, match=f"drive.csv: is {kind}, whatever its name says"):
         read_table(tmp_path / "drive.csv")
+    (tmp_path / "drive.csv").write_text("PAR1,PAR2,t\n" + "1,2,3\n" * 20)  # a text that begins like a Parquet file
+    assert list(read_table(tmp_path / "drive.csv").columns) == ["PAR1", "PAR2", "t"]

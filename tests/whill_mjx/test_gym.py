@@ -71,6 +71,8 @@ def test_observations_are_the_users_own(env):
     image[:] = 7
     again, *_ = env.step(STILL)
     assert (image == 7).all() and (again != 7).any()
+    again[:] = 7
+    assert (env.render() != 7).any()
 
 
 def test_misuse_is_explained(monkeypatch):

@@ -92,3 +92,7 @@ def test_a_thing_of_no_size_is_refused_with_the_name_of_the_size(size):
         box(0.0, 0.0, 1.0, size, 1.0, (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="radius is .* must be above 0"):
         post(0.0, 0.0, 1.0, size, (1.0, 0.0, 0.0))
+
+
+def test_a_box_that_is_not_there_may_have_no_size():
+    assert not box(0.0, 0.0, 0.0, 0.0, 0.0, GREY, mask=False).mask.any()

@@ -128,7 +128,7 @@ class WhillEnv(Carried, gymnasium.Env):
 
     def _shown(self, time_step: Any) -> Any:
         obs = jax.tree.map(np.array, time_step.obs)  # copies: JAX's own cannot be changed in place
-        self._image = None if isinstance(obs, dict) else obs
+        self._image = None if isinstance(obs, dict) else obs.copy()
         if self.render_mode == "human":
             show_window(self._picture())
         return obs

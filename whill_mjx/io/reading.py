@@ -82,20 +82,25 @@ def read_text(path: str | Path, limit: int, missing: str) -> str:
 
 def decoded(path: str | Path, data: bytes) -> str:
     """The text of UTF-8 bytes; ValueError names the first line that is not text."""
-    kind = next((kind for begin, kind in BINARY.items() if data.startswith(begin)), None)
-    if kind is not None:
-        raise ValueError(f"{path}: is {kind}, whatever its name says, and no text. Give a text file; unpack an archive "
-                         "first.")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        _refuse_binary(path, data)
         line = data.count(b"\n", 0, error.start) + 1
         raise ValueError(f"{path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8. Save the file as UTF-8."
                          ) from None
     if "\0" in text:
+        _refuse_binary(path, data)
         line = text.count("\n", 0, text.index("\0")) + 1
         raise ValueError(f"{path}, line {line}: has a NUL byte, which is no text. Save it as UTF-8, or copy it again.")
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def _refuse_binary(path: str | Path, data: bytes) -> None:
+    kind = next((kind for begin, kind in BINARY.items() if data.startswith(begin)), None)
+    if kind is not None:
+        raise ValueError(f"{path}: is {kind}, whatever its name says, and no text. Give a text file; unpack an archive "
+                         "first.") from None
 
 
 def read_toml(path: str | Path, missing: str, hint: str) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def check(options: TrainOptions, preset: Preset, processes: int = 1) -> None:
         vehicle = spec_of_log(options.log)
     env, params = make_env(preset.task, vehicle, looks=preset.looks)
     check_world(env.task)  # of this vehicle, which a map may not have room for
-    check_stop_success(options.stop_success, env.task)
+    check_stop_success(preset.stop_success, env.task)
     check_memory(preset, options.learner, env)
     check_learner(preset, options.learner, make_batch(env, params, preset.instances))
     if any(text != "fit" for text in preset.vary):
@@ -52,4 +52,5 @@ def check_stop_success(share: float | None, task: Task) -> None:
     names = () if share is None else ending_names(task)
     if share is not None and "success" not in names:
         raise OptionError(f"--stop-success {share:g}: task {task.name!r} has no ending 'success' (it has: "
-                          f"{', '.join(names)}). Leave the option out, or call one of the endings 'success'.")
+                          f"{', '.join(names)}). Leave it out, of the task's budget too, or call one of the endings "
+                          "'success'.")

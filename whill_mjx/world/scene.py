@@ -160,7 +160,8 @@ def box(x, y, length, width, height, colour, yaw=0.0, mask=True) -> Boxes:
     Raises:
         ValueError: a size that is no number above 0; sizes that are traced are taken as they come.
     """
-    check_sizes(length=length, width=width, height=height)
+    if mask is not False:  # what is not there may have no size
+        check_sizes(length=length, width=width, height=height)
     centre = jnp.stack([jnp.asarray(value, jnp.float32) for value in (x, y, height / 2)])
     half = jnp.stack([jnp.asarray(value, jnp.float32) / 2 for value in (length, width, height)])
     return Boxes(

@@ -72,7 +72,7 @@ def check_sizes(**sizes: Any) -> None:
     """Raise ValueError for sizes in plain numbers that are not above 0 and finite."""
     for name, size in sizes.items():
         if isinstance(size, int | float) and not 0.0 < size < math.inf:
-            raise ValueError(f"{name} is {size:g} m; it must be above 0 and finite, or a thing is hit where it is not.")
+            raise ValueError(f"{name} is {size:g} m; it must be above 0 and finite. Give a positive size.")
 
 
 def post(x, y, height, radius, colour) -> Rounds:

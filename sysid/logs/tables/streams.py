@@ -114,7 +114,7 @@ def _rows_of_file(
 
 
 def _with_orientation(found: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
-    """The rows (T,) without those whose quaternion is all zero, unless all are, and how many these were."""
+    """The rows (T,) that have an orientation, and how many have a quaternion of zeros; all rows where none has one."""
     parts = [found[name] for name in ("qx", "qy", "qz", "qw") if name in found]
     known = np.any(parts, axis=0) if "qw" in found else np.ones(len(found["t"]), bool)
     if not known.any():
