@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
+import importlib
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,6 +14,7 @@ from types import ModuleType
 
 from sysid.replay.models import Model
 from whill_mjx.effects import EFFECTS
+from whill_mjx.io.modules import run_file
 from whill_mjx.vehicle.specs import VehicleSpec
 from whill_mjx.vehicle.vehicle_file import ROBOT_FILES
 
@@ -101,14 +102,8 @@ def _modules_beside(path: Path) -> Iterator[list[Path]]:
 def _run(path: Path) -> ModuleType:
     """The module of a Python file; ValueError where it does not run."""
     alias = f"model_{path.stem}_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:8]}"
-    loader = importlib.util.spec_from_file_location(alias, path)
-    assert loader is not None and loader.loader is not None
-    module = importlib.util.module_from_spec(loader)
-    sys.modules[alias] = module  # dataclasses look their module up
     try:
-        loader.loader.exec_module(module)
+        return run_file(path, alias)
     except (Exception, SystemExit) as error:
-        del sys.modules[alias]
         raise ValueError(f"{path}: ends in {type(error).__name__} when it is run ({error}). Correct it; run it alone "
                          "to see where.") from error
-    return module

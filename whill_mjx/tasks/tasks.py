@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import importlib
-import importlib.util
 import inspect
 import sys
 import traceback
@@ -24,6 +23,7 @@ from typing import Any
 import jax
 
 from whill_mjx.io.command_line import one_line
+from whill_mjx.io.modules import run_file
 from whill_mjx.io.registry import Registry
 from whill_mjx.tasks.base import LAYOUTS as LAYOUTS
 from whill_mjx.tasks.base import Budget as Budget
@@ -180,17 +180,7 @@ def _import_file(path: Path) -> ModuleType:
     """Module of a file; one that is edited is read anew."""
     version = hashlib.sha256(str(path).encode() + path.read_bytes())
     alias = f"task_{path.stem}_{version.hexdigest()[:8]}"
-    if alias not in sys.modules:
-        spec = importlib.util.spec_from_file_location(alias, path)
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[alias] = module  # dataclasses look their module up
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[alias]
-            raise
-    return sys.modules[alias]
+    return sys.modules.get(alias) or run_file(path, alias)
 
 
 def _line(place: str, error: BaseException) -> str:
