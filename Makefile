@@ -7,6 +7,12 @@ BIN := $(VENV)/bin
 COMMA := ,
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
+# $(call once_more,COMMAND): a run of tests. Failed ones run once more, alone: what passes there failed by what ran beside it.
+define once_more
+	$(1) || { [ $$? -eq 1 ] && echo "The failed tests run once more, alone." && \
+		$(BIN)/python -m pytest -q --last-failed --last-failed-no-failures none; }
+endef
+
 .PHONY: train loop test test-quick test-long lint docs notebooks coverage constraints release clean
 
 # $(call beating,COMMAND): a command, and every 8 s a line with the time that it has taken.
@@ -49,10 +55,10 @@ loop: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.loop --out $(LOOP)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30
+	$(call once_more,$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30)
 
 test-quick: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick
+	$(call once_more,$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick)
 
 # Damage, kills and full disks in numbers, and the seconds of each notebook: an hour or more.
 test-long: $(VENV)/.installed-dev $(VENV)/.installed-docs

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from bridge.policy.parts import EXPORT_AGAIN, MIB, PolicyFileError
 
 TRIAL_SECONDS = 0.5
 """Processor time in which a small network must be built and make a step, twice: five control periods at 10 Hz."""
+START_SECONDS = 0.2
+"""Processor time in which a desktop starts this process. A computer that takes longer is given more in proportion."""
 BUILD_RATE = 100e6
 """Bytes of a network for which one more second is given. A desktop builds 25 MB twice in 0.2 s."""
 WALL_SECONDS = 60.0
@@ -78,18 +81,20 @@ class Trial:
         try:
             given = json.dumps(request).encode() + b"\n" + network
             said = self._process.communicate(given, WALL_SECONDS)
-            answer, errors = (text.decode("utf-8", "replace") for text in said)
+            told, errors = (text.decode("utf-8", "replace") for text in said)
+            granted, _, answer = told.partition("\n")
+            allowed = f"{granted} of processor time"
         except subprocess.TimeoutExpired:
             self._process.kill()
-            answer, errors = LATE, ""
+            answer, errors, allowed = LATE, "", f"{WALL_SECONDS:.0f} s"
         code = self._process.poll() or 0
         if answer == OK:
             return
         if answer.startswith(BAD):
             raise PolicyFileError(f"{name}: {answer.removeprefix(BAD)}. {EXPORT_AGAIN}.")
         if answer == LATE or code == -getattr(signal, "SIGPROF", 0):
-            raise PolicyFileError(f"{name}: a first step is not done after {seconds:.1f} s of processor time. A step "
-                                  f"must be much shorter than a control period. {EXPORT_AGAIN}.")
+            raise PolicyFileError(f"{name}: a first step is not done after {allowed}. A step "
+                                  "must be much shorter than a control period. {EXPORT_AGAIN}.")
         problem = (answer or errors[-500:]).strip() or f"the process of its trial step ended with code {code}"
         raise PolicyFileError(f"{name}: onnxruntime refuses it: {problem}. It must hold standard operators that this "
                               f"runtime knows, and a step must fit in {request['memory']} bytes. {EXPORT_AGAIN}, or "
@@ -103,14 +108,17 @@ def leave_realtime() -> None:
 
 
 def main() -> None:
-    """Answer one trial: the request as a line of JSON and the network come in, the answer goes out."""
+    """Answer one trial: the request as a line of JSON and the network come in. The time granted and the answer go out."""
     leave_realtime()
     import onnxruntime
 
     onnxruntime.set_default_logger_severity(4)
+    started = time.process_time()
     request = json.loads(sys.stdin.buffer.readline())
     network = sys.stdin.buffer.read()
-    _limit(request)
+    seconds = request["seconds"] * max(1.0, started / START_SECONDS)
+    print(f"{seconds:.1f} s", flush=True)
+    _limit(seconds, request["memory"])
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.enable_cpu_mem_arena = False  # it grows by powers of two, beyond what is needed
@@ -156,18 +164,18 @@ def _compare(kind: str, wanted: list[Tensor], found: list[Tensor]) -> None:
         raise _Refused(f"{kind} {str(got)[:1000]}, but policy.json says {str(want)[:1000]}: both must agree")
 
 
-def _limit(request: dict[str, Any]) -> None:
-    """Let the system end this process where it takes more time than requested, and refuse it more memory."""
+def _limit(seconds: float, memory: int) -> None:
+    """Let the system end this process after `seconds` of processor time, and refuse it more memory than that [bytes]."""
     try:
         import resource
     except ImportError:
         return  # not on Windows: there only the wall clock limits the trial
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_PROF, request["seconds"])
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         with open("/proc/self/statm") as statm:
             used = int(statm.read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (used + request["memory"],) * 2)
+        resource.setrlimit(resource.RLIMIT_AS, (used + memory,) * 2)
     except (OSError, ValueError):
         pass  # no such limit on this system

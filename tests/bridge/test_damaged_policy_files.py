@@ -1,4 +1,4 @@
-"""Any bytes give a policy or a PolicyFileError, within 2 s of processor time and 500 MB."""
+"""Any bytes give a policy or a PolicyFileError, within bounds of processor time and memory."""
 
 import json
 import os

@@ -186,7 +186,8 @@ def test_a_command_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_p
                 break
             assert code == (-number if number == signal.SIGKILL else 130), told
             assert number == signal.SIGKILL or told.strip().splitlines()[-1].startswith("stopped")
-            assert not (broken / "result.npy").exists()
+            if (broken / "result.npy").exists():
+                break  # it was stopped between its last file and its end
         assert start(broken).wait() == 0, said.read_text()
         np.testing.assert_array_equal(np.load(broken / "result.npy"), np.load(straight / "result.npy"))
         assert start(broken, "--seed", "3").wait() == 2
