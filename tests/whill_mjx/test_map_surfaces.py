@@ -112,10 +112,19 @@ def test_packed_bytes_are_unpacked():
 
 @pytest.mark.parametrize("name, content, message", [
     ("a.npy", b"\x93NUMPY", "Export it again"),
-    ("a.pcd", b"VERSION 0.7\nFIELDS x y z\n", "Export it again"),
+    ("a.pcd", b"VERSION 0.7\nFIELDS x y z\n", "header does not end in a line DATA"),
+    ("a.pcd", b"SIZE 4 4\nTYPE F F\nPOINTS 1\nDATA ascii\n", "header has no line FIELDS"),
+    ("a.pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 1\nDATA ascii\n1 1\n", "fields are x, y, and x, y and z"),
+    ("a.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 20\nDATA ascii\n" + 12 * b"1 2 0\n",
+     "cut short: it announces 20 points, and 12 are there"),
     ("a.stl", b"solid nothing", "Export it again"),
     ("a.glb", b"glTF....", "Export it again"),
     ("a.stl", bytes(80) + (60).to_bytes(4, "little") + bytes(50 * 59), "cut short: .* counts 60 triangles, and 59 are"),
+    ("a.stl", b"solid room\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n", "cut short: .* endsolid"),
+    ("a.glb", b"glTF" + (2).to_bytes(4, "little") + (100).to_bytes(4, "little") + bytes(20), "100 bytes, and 32 are"),
+    ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "a face has a corner that is not there"),
+    ("a.gltf", b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "room.bin", "byteLength": 4}]}',
+     "room.bin, which is not beside it"),
     ("a.gltf", b"{VERSION", "JSON.* line 1 column 2"),
     ("a.pcd", b"FIELDS x y z\nTYPE F F Q\nSIZE 4 4 9\nPOINTS 1\nDATA binary\n", "type Q and the size 9 .known: F 4,"),
 ])  # fmt: skip

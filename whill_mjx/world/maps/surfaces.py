@@ -108,7 +108,7 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
     _check_content(kind, data)
     # A .gltf and an .obj name other files beside them.
     if kind in ("gltf", "obj"):
-        loaded: Any = trimesh.load(path, process=False)
+        loaded: Any = _with_neighbours(path)
     else:
         loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False)
     parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
@@ -125,11 +125,28 @@ def _by_trimesh(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray | None]
     return points, None if faces is None or not len(faces) else np.asarray(faces)
 
 
+def _with_neighbours(path: Path) -> Any:
+    """What trimesh reads of a file that may name others beside it."""
+    import trimesh
+
+    try:
+        return trimesh.load(path, process=False)
+    except FileNotFoundError as error:
+        raise ValueError(f"it names the file {error}, which is not beside it: put it there, or take one .glb") from None
+    except IndexError as error:
+        raise ValueError(f"a face has a corner that is not there: {error}") from None
+
+
 def _check_content(kind: str, data: bytes) -> None:
     """ValueError for what trimesh accepts, or refuses for a misleading reason."""
     counted, there = int.from_bytes(data[80:84], "little"), (len(data) - 84) // 50
-    if kind == "stl" and b"\0" in data and counted > there:  # text has no zero bytes
+    text = b"\0" not in data
+    if kind == "stl" and not text and counted > there:
         raise ValueError(f"it is cut short: its header counts {counted} triangles, and {max(there, 0)} are there")
+    if kind == "stl" and text and data.lstrip().startswith(b"solid") and b"endsolid" not in data:
+        raise ValueError("it is cut short: it does not end in a line endsolid")
+    if kind == "glb" and (size := int.from_bytes(data[8:12], "little")) > len(data):
+        raise ValueError(f"it is cut short: its header counts {size} bytes, and {len(data)} are there")
     if kind == "obj" and ZERO_CORNER.search(data):
         raise ValueError("a face has the corner 0, and the corners begin at 1")
     if kind == "gltf":
@@ -148,14 +165,7 @@ def _check_corners(shape: tuple[int, ...], faces: Any) -> None:
 
 def _pcd(data: bytes) -> tuple[np.ndarray, None]:
     """Points of a PCD file of version 0.7: ascii, binary or binary_compressed."""
-    header: dict[str, list[str]] = {}
-    place = 0
-    while "DATA" not in header:
-        end = data.index(b"\n", place)
-        words = data[place:end].decode("ascii").split()
-        place = end + 1
-        if words and not words[0].startswith("#"):
-            header[words[0]] = words[1:]
+    header, place = _pcd_header(data)
     counts = [int(word) for word in header.get("COUNT", ["1"] * len(header["FIELDS"]))]
     types = list(zip(header["TYPE"], map(int, header["SIZE"]), strict=True))
     for kind, size in types:
@@ -173,6 +183,8 @@ def _pcd(data: bytes) -> tuple[np.ndarray, None]:
         first = np.cumsum([0, *counts])
         columns = [int(first[names.index(name)]) for name in wanted]
         rows = np.loadtxt(io.BytesIO(data[place:]), ndmin=2, max_rows=number, usecols=columns)
+        if len(rows) < number:
+            raise ValueError(f"it is cut short: it announces {number} points, and {len(rows)} are there")
         return rows, None
     dtype = np.dtype([(name, kind, (count,)) for name, kind, count in zip(names, kinds, counts, strict=True)])
     if header["DATA"][0] == "binary":
@@ -186,6 +198,26 @@ def _pcd(data: bytes) -> tuple[np.ndarray, None]:
         found[name] = np.frombuffer(raw, kind, number * count, place).reshape(number, count)[:, 0]
         place += size
     return np.stack([found[name] for name in wanted], 1).astype(float), None
+
+
+def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], int]:
+    """Words of each line by its first one, and the place at which the points begin."""
+    header: dict[str, list[str]] = {}
+    place = 0
+    while "DATA" not in header:
+        end = data.find(b"\n", place)
+        if end < 0:
+            raise ValueError("its header does not end in a line DATA")
+        words = data[place:end].decode("ascii").split()
+        place = end + 1
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+    missing = [name for name in ("FIELDS", "SIZE", "TYPE", "POINTS") if not header.get(name)]
+    if missing:
+        raise ValueError(f"its header has no line {' or '.join(missing)}")
+    if not {"x", "y", "z"} <= set(header["FIELDS"]):
+        raise ValueError(f"its fields are {', '.join(header['FIELDS'])}, and x, y and z are needed")
+    return header, place
 
 
 def _lzf(data: bytes, size: int) -> bytes:
