@@ -23,6 +23,7 @@ from benchmarks.harness import figure, record
 from whill_mjx.io import command_line
 from whill_mjx.world.people import law
 from whill_mjx.world.people.crowd import GAP, Crowd, people_on
+from whill_mjx.world.plane import Vector
 
 CLAIM = "Obstacle course with physics, camera image, reward and auto-reset"
 DT = 0.1
@@ -103,10 +104,9 @@ def simulator(tracks: list[Track], walls: tuple[float, float]) -> Callable[[floa
     order = jax.random.permutation(jax.random.key(1), count)
     quantile = jax.scipy.special.ndtri((order + 0.5) / count)
 
-    def near(place: jax.Array) -> law.Near:
-        x = place[:, 0]
-        points = jnp.stack([jnp.stack([x, jnp.full(count, wall)], -1) for wall in walls], 1)
-        return law.Near(points, jnp.ones((count, 2), bool))
+    def near(place: Vector) -> law.Near:
+        points = Vector(jnp.stack([place.x] * len(walls)), jnp.stack([jnp.full(count, wall) for wall in walls]))
+        return law.Near(points, jnp.ones((len(walls), count), bool))
 
     @jax.jit
     def run(speed, spread, gap):
@@ -117,7 +117,7 @@ def simulator(tracks: list[Track], walls: tuple[float, float]) -> Callable[[floa
             apart = jnp.linalg.norm(crowd.position[None] - first[:, None], axis=-1)
             blocked = jnp.any(crowd.there & (apart < 2 * law.RADIUS + law.ASIDE), -1)
             enters = (number * DT >= enter) & ~entered & ~blocked
-            crowd = law.walk(dataclasses.replace(crowd, there=crowd.there | enters), near, None, DT)
+            crowd = law.walk(dataclasses.replace(crowd, there=crowd.there | enters), lambda _: near, None, DT)
             seen = (crowd.position, crowd.there)
             gone = (crowd.position[:, 0] - out[:, 0]) * side >= 0.0
             return (dataclasses.replace(crowd, there=crowd.there & ~gone), entered | enters), seen

@@ -1,1 +1,23 @@
 """Thin ROS 2 bridge: runs a policy file on the vehicle, and the simulator behind the same topics."""
+
+import os
+import signal
+import sys
+from types import FrameType
+
+
+def _is_starting() -> bool:
+    """Return whether this process is a command of this package whose imports are under way."""
+    words = sys.orig_argv
+    module = words[words.index("-m") + 1] if sys.argv[:1] == ["-m"] and "-m" in words[:-1] else ""
+    return module.partition(".")[0] == __name__ or os.path.basename(sys.argv[0]).startswith(("bridge-", "bridge_"))
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """End at once, without the traceback of an import: nothing was begun."""
+    os.write(2, b"bridge: stopped before the work began (SIGINT)\n")
+    os._exit(130)
+
+
+if _is_starting() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _leave)  # until `ends_at_ctrl_c`

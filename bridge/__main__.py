@@ -17,7 +17,12 @@ def first_line(name: str) -> str:
 
 
 def main() -> None:
-    """Print the list."""
+    """Print the list; refuse words, which would do nothing."""
+    if words := [word for word in sys.argv[1:] if word not in ("-h", "--help")]:
+        known = words[0].removeprefix("bridge.").replace("-", "_")
+        remedy = f"Type python -m bridge.{known}" if known in COMMANDS else "Leave it out for the list of commands"
+        print(f"python -m bridge: {words[0]}: takes no words. {remedy}.", file=sys.stderr)
+        raise SystemExit(2)
     for name in COMMANDS:
         print(f"python -m bridge.{name:<12} {first_line(name)}")
     print("Each has --help.")

@@ -18,6 +18,7 @@ from typing import Any
 
 from bridge.driving.bases import WHILL
 from bridge.nodes import ros
+from bridge.nodes.commands import finite_command
 from bridge.nodes.exits import Exit
 from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, topic_name
 from bridge.nodes.parameters import command_line
@@ -72,6 +73,11 @@ class Expiry:
         self._left -= 1
         return True
 
+    @property
+    def owed(self) -> int:
+        """Zeros that are still to be sent after the last command."""
+        return self._left
+
 
 class JoyNode:
     """Turns commands into a joystick's deflection."""
@@ -81,17 +87,24 @@ class JoyNode:
         from sensor_msgs.msg import Joy
 
         self.node, self._full, self._expiry, self._joy = node, Deflection(*options.full), Expiry(), Joy
+        self._topic = options.command_topic
         self._publisher = node.create_publisher(Joy, options.joy_topic, ros.reliable(10))
         node.create_subscription(Twist, options.command_topic, self._on_command, ros.reliable(10))
         ros.steady_timer(node, PERIOD, self._on_timer)
 
     def _on_command(self, message: Any) -> None:
         self._expiry.command(time.monotonic())
-        self.publish(message.linear.x, message.angular.z)
+        self.publish(*finite_command(self.node, self._topic, message.linear.x, message.angular.z))
 
     def _on_timer(self) -> None:
         if self._expiry.zero_is_due(time.monotonic()):
             self.publish(0.0, 0.0)
+
+    def close(self) -> None:
+        """Leave the chair standing where a command moved it, and else to its rider."""
+        for _ in range(self._expiry.owed):
+            self.publish(0.0, 0.0)
+            time.sleep(PERIOD)
 
     def publish(self, v: float, omega: float) -> None:
         """Send one deflection."""
@@ -123,9 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             ros.spin(node)
         finally:
-            for _ in range(3):
-                joy.publish(0.0, 0.0)
-                time.sleep(0.02)
+            joy.close()
     return Exit.DONE
 
 

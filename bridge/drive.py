@@ -39,9 +39,9 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--calibration", type=Path, metavar="FILE",
                         help="of the camera's lens (YAML of camera_calibration): the policy sees what the camera of "
                         "its training would see")
-    parser.add_argument("--stamp-age", type=in_range(0, infinite=True), default=SafetyConfig.stamp_age,
+    parser.add_argument("--stamp-age", type=in_range(0, infinite=True, above=True), default=SafetyConfig.stamp_age,
                         help="largest age of a stamp [s]; inf where camera and bridge share no clock")
-    parser.add_argument("--frame-age", type=in_range(0, infinite=True), default=SafetyConfig.frame_age,
+    parser.add_argument("--frame-age", type=in_range(0, infinite=True, above=True), default=SafetyConfig.frame_age,
                         help="largest age of a frame since its receipt [s]")
     parser.add_argument("--pace", choices=("wall", "stamp"), default="wall",
                         help="clock of the policy's rate; stamp: for a simulator that is not in real time")
@@ -105,10 +105,10 @@ def main(arguments: list[str] | None = None) -> int:
             ros.spin(node)
         finally:
             drive.close()
-        if options.results:
-            supervisor = drive.supervisor
-            ros.write_json(options.results, {"counts": dict(supervisor.counts), "reason": supervisor.reason})
-    return Exit.DONE
+        supervisor = drive.supervisor
+        results = {"counts": dict(supervisor.counts), "reason": supervisor.reason}
+        written = not options.results or ros.write_results("bridge.drive", options.results, results)
+    return Exit.DONE if written else Exit.FAULT
 
 
 if __name__ == "__main__":

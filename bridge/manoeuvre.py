@@ -81,6 +81,17 @@ def prepare(options: argparse.Namespace) -> tuple[CommandTable, SafetyConfig, st
     return table, safety, place
 
 
+def trial_names(options: argparse.Namespace) -> list[str]:
+    """Return the names of replicates that must be checked: the first one, and those that the dataset has already."""
+    def name(number: int) -> str:
+        return f"{options.trial}_{number}"
+
+    ends = (one.name.rpartition("_")[2] for one in (options.dataset / "trials").glob("*"))
+    numbers = {int(end) for end in ends if end.isdecimal() and end.isascii()}
+    wanted = range(options.first, options.first + options.repeat)
+    return [name(number) for number in sorted({options.first, *(one for one in numbers if one in wanted)})]
+
+
 @ends_at_ctrl_c
 def main(arguments: list[str] | None = None) -> int:
     """Drive until all replicates are done, SIGTERM or Ctrl-C.
@@ -92,8 +103,8 @@ def main(arguments: list[str] | None = None) -> int:
         options = parse_arguments(parameters.with_options(ros_arguments, ros.MANOEUVRE_NAME, "commands", own))
         table, safety, place = prepare(options)
         if options.dataset and not options.check:
-            for number in range(options.first, options.first + options.repeat):
-                TrialWriter.check(options.dataset, f"{options.trial}_{number}")
+            for name in trial_names(options):
+                TrialWriter.check(options.dataset, name)
             check_dataset(options.dataset)
             options.dataset.mkdir(parents=True, exist_ok=True)
             write_dataset_file(options.dataset, options)

@@ -23,7 +23,7 @@ from bridge.recording.dataset_file import add_dataset_options, check_dataset, wr
 from bridge.recording.record_node import RecordNode
 from bridge.recording.recovery import recover
 from bridge.recording.split_writer import SplitWriter
-from bridge.recording.trial_writer import PARTIAL, TrialWriter
+from bridge.recording.trial_writer import PARTIAL, TrialWriter, left_out
 
 
 def parse_arguments(arguments: list[str]) -> argparse.Namespace:
@@ -49,14 +49,20 @@ def parse_arguments(arguments: list[str]) -> argparse.Namespace:
 def finish(writer: TrialWriter | SplitWriter) -> bool:
     """End a recording and say what it holds; return whether its end could be written."""
     try:
+        if isinstance(writer, TrialWriter) and writer.is_empty:
+            writer.drop()
+            print("bridge.record: nothing was recorded, so there is no trial", file=sys.stderr)
+            return True
         folder = writer.close()
     except OSError as error:
-        print(f"bridge.record: {error}", file=sys.stderr)
+        print(f"bridge.record: {error.strerror}", file=sys.stderr)
         return False
     if isinstance(writer, TrialWriter):
         say_trial(folder, writer.rows)
     elif not writer.trials:
         print("bridge.record: nothing was recorded: the vehicle never moved", file=sys.stderr)
+    for line in left_out(writer.left_out):
+        print(f"bridge.record: {line}", file=sys.stderr)
     return True
 
 
@@ -96,28 +102,25 @@ def main(arguments: list[str] | None = None) -> int:
         return main_recover(options.dataset)
     try:
         check_dataset(options.dataset)
-        writer: TrialWriter | SplitWriter
-        if options.split:
-            writer = SplitWriter(options.dataset, options.trial, options.split, say_trial)
-        else:
-            writer = TrialWriter(options.dataset, options.trial)
-        options.dataset.mkdir(parents=True, exist_ok=True)
-        write_dataset_file(options.dataset, options)
+        TrialWriter.check(options.dataset, f"{options.trial}_0" if options.split else options.trial)
+        with ros.node_session(ros.RECORD_NAME, ros_arguments) as node:
+            options.dataset.mkdir(parents=True, exist_ok=True)
+            writer: TrialWriter | SplitWriter = (
+                SplitWriter(options.dataset, options.trial, options.split, say_trial) if options.split
+                else TrialWriter(options.dataset, options.trial))
+            try:
+                write_dataset_file(options.dataset, options)
+                recorder = RecordNode(node, writer, options, options.seconds)
+                ros.spin(node, recorder.finished)
+            finally:
+                whole = finish(writer)
     except (ValueError, OSError) as error:
         print(f"bridge.record: {said(error)}", file=sys.stderr)
         return refusal(error)
-    failed = False
-    try:
-        with ros.node_session(ros.RECORD_NAME, ros_arguments) as node:
-            recorder = RecordNode(node, writer, options, options.seconds)
-            ros.spin(node, recorder.finished)
-            failed = recorder.failure is not None
-            for topic, count in recorder.lost().items():
-                print(f"bridge.record: {topic}: {count} messages were lost on the way. Record on the vehicle's own "
-                      "computer, or let the publisher be reliable.", file=sys.stderr)
-    finally:
-        whole = finish(writer)
-    if failed or not whole:
+    for topic, count in recorder.lost().items():
+        print(f"bridge.record: {topic}: {count} messages were lost on the way. Record on the vehicle's own computer, "
+              "or let the publisher be reliable.", file=sys.stderr)
+    if recorder.failure is not None or not whole:
         print("bridge.record: the recording ended early, because nothing could be written any more", file=sys.stderr)
         return Exit.FAULT
     if not writer.rows["odometry"]:

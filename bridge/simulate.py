@@ -25,7 +25,7 @@ from bridge.nodes.options import Parser, ends_at_ctrl_c, in_range, result_file, 
 from bridge.nodes.parameters import command_line
 from bridge.policy import PolicyFileError
 from bridge.simulation.simulate_node import RESULTS, SimulateNode
-from bridge.simulation.simulator_choice import SIMULATOR, make_vehicle
+from bridge.simulation.simulator_choice import SIMULATOR, ready_vehicle
 
 TOKEN_VARIABLE = "BRIDGE_TOKEN"
 """Environment variable with the token of episode control; on a command line everybody could read it."""
@@ -98,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
         compiling = guarded("bridge.simulate: stopped")  # a signal ends it while XLA compiles, too
     with compiling:
         try:
-            vehicle = make_vehicle(options)
+            vehicle = ready_vehicle(options)
         except (ValueError, FileNotFoundError) as error:
             print(f"bridge.simulate: {error}", file=sys.stderr)
             return Exit.FAULT if isinstance(error, PolicyFileError) else Exit.REFUSED
@@ -115,9 +115,8 @@ def main(arguments: list[str] | None = None) -> int:
         ros.spin(node, simulate.finished)
         if server is not None:
             server.close()
-        if options.results:
-            ros.write_json(options.results, simulate.results())
-    return Exit.DONE
+        written = not options.results or ros.write_results("bridge.simulate", options.results, simulate.results())
+    return Exit.DONE if written else Exit.FAULT
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from dreamer.refusals import INT32
+
 LEAST_TRAIN_RATIO = 0.001
 """Replayed steps are credited in fractions whose denominator is at most its inverse."""
 RANGES: dict[str, tuple[float, float]] = {
@@ -27,7 +29,7 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("mean_pull", "policy_outscale", "entropy_scale", "slow_reg", "replay_value_scale", "barlow_scale",
                      "barlow_redundancy", "dyn_scale", "rep_scale", "recon_scale", "vector_scale", "reward_scale",
                      "continue_scale", "free_nats", "behavior_lr", "agc", "agc_min_norm", "eps"), (0, 1e12)),
-    **dict.fromkeys(("learning_starts", "pretrain_steps", "pretrain_updates", "warmup", "lr_decay"), (0, 1e12)),
+    **dict.fromkeys(("learning_starts", "pretrain_steps", "pretrain_updates", "warmup", "lr_decay"), (0, INT32)),
     "replay_capacity": (1, 1e12),
     "mirror": (0, 1000),
 }  # fmt: skip

@@ -13,6 +13,7 @@ import numpy as np
 from dreamer import spaces
 from dreamer.config import DreamerConfig
 from dreamer.model import agent as agents
+from dreamer.refusals import INT32, whole
 from dreamer.training import seeds
 from dreamer.training.programs import Kept, Programs
 from dreamer.types import FunctionalEnv, Params
@@ -54,10 +55,9 @@ def evaluate(
         environment on the last frame.
 
     Raises:
-        ValueError: episodes is not positive.
+        ValueError: episodes is no whole number of at least 1.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes = {episodes}: it must be at least 1. Pass a positive number.")
+    episodes = whole("episodes", episodes, 1, INT32)
     several = bool(seeds.count(params))
     play = _compiled(env, config, rounds, several)
     keys = jax.random.split(key, -(-episodes // env.num_envs))
@@ -80,7 +80,7 @@ def play_round(
 ) -> dict[str, jax.Array]:
     """The first episode of every instance: arrays (N,) as in `evaluate`."""
     reset_key, _ = jax.random.split(key)
-    env_state, transition = env.reset(reset_key)
+    env_state, transition = env.begin(reset_key)
     zeros = jnp.zeros((env.num_envs,), jnp.float32)
     start = {
         "return": zeros,
@@ -96,7 +96,7 @@ def play_round(
     def advance(loop: tuple) -> tuple:
         step, env_state, transition, carry, result = loop
         carry, action = agents.act(config, params, carry, transition.obs, transition.is_first, agents.Choice())
-        env_state, transition = env.step(env_state, actions.to_env(action))
+        env_state, transition = env.advance(env_state, actions.to_env(action))
         active = ~result["finished"]
         ends = active & transition.is_last
         new = {

@@ -91,12 +91,17 @@ class Policy:
             Action: (A,) in [-1, 1], a class () int32, or of a vehicle's file the command in its units.
 
         Raises:
-            ValueError: an observation of another shape or type than the policy was trained with.
+            ValueError: an observation of another shape or type than the policy was trained with, or one that is not
+                finite.
         """
         wanted = jax.eval_shape(lambda: spaces.zeros(self.obs_shape))
         found = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), np.asarray(x).dtype), obs)
         if found != wanted:
             raise ValueError(f"the observation is {found}; the policy was trained with {wanted}. Convert it.")
+        for path, value in jax.tree_util.tree_flatten_with_path(obs)[0]:
+            if not np.isfinite(value).all():
+                raise ValueError(f"the observation{jax.tree_util.keystr(path)} is not finite ({value}). Give numbers, "
+                                 "or stop the vehicle where a sensor has none.")
         carry, action = self.call(self.zero_carry if carry is None else carry, obs)
         return np.asarray(action), carry
 

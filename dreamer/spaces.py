@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from dreamer.config import DreamerConfig
 from dreamer.layers import distributions as dist
+from dreamer.refusals import is_whole
 
 Shape = tuple[int, ...]
 ObsShape = Shape | Mapping[str, Shape]
@@ -35,8 +36,8 @@ def image_shape(obs_shape: ObsShape) -> tuple[int, int, int] | None:
     Raises:
         ValueError: images of different sizes, an observation that is neither image nor vector, or none at all.
     """
-    bad = [shape for shape in shapes(obs_shape) if len(shape) not in (1, 3) or min(shape) < 1]
-    if bad or not shapes(obs_shape):
+    named = obs_shape if isinstance(obs_shape, Mapping) else {"": obs_shape}
+    if not named or not all(isinstance(name, str) and _is_shape(shape) for name, shape in named.items()):
         raise ValueError(
             f"obs_shape = {obs_shape}: there must be observations, each an image (H, W, C) or a vector (D,). Reshape "
             "the others."
@@ -48,6 +49,11 @@ def image_shape(obs_shape: ObsShape) -> tuple[int, int, int] | None:
             "channels. Resize them, or give the smaller ones as vectors."
         )
     return (images[0][0], images[0][1], sum(shape[2] for shape in images)) if images else None
+
+
+def _is_shape(shape: Any) -> bool:
+    """Whether this is (H, W, C) or (D,)."""
+    return isinstance(shape, tuple | list) and len(shape) in (1, 3) and all(is_whole(n) and n >= 1 for n in shape)
 
 
 def vector_size(obs_shape: ObsShape) -> int:
@@ -241,9 +247,11 @@ def actions(spec: ActionSpec) -> Box | Discrete:
     Raises:
         ValueError: no action at all, or a single class.
     """
-    kind = Box(spec) if isinstance(spec, int) else spec
-    if kind.width < 1 or kind.outputs < 2:
-        raise ValueError(f"action_dim = {spec}: a box needs a size of at least 1, a choice at least 2 classes.")
+    kind: Any = Box(spec) if is_whole(spec) else spec  # type: ignore[arg-type]
+    known = isinstance(kind, Box | Discrete) and is_whole(kind.width)
+    if not known or kind.width < 1 or kind.outputs < 2:
+        raise ValueError(f"action_dim = {spec!r}: it must be a whole number, dreamer.Box or dreamer.Discrete; a box "
+                         "needs a size of at least 1, a choice at least 2 classes. Correct it.")
     return kind
 
 

@@ -21,6 +21,7 @@ from dreamer.evaluate import evaluate
 from dreamer.experience import pretrain
 from dreamer.experience.iteration import (
     TrainState,
+    check_fit,
     compile_init,
     compile_iteration,
     init_state,
@@ -28,9 +29,10 @@ from dreamer.experience.iteration import (
     train_iteration,
 )
 from dreamer.model.agent import AgentState
+from dreamer.refusals import as_seeds, check_duration, check_kind, whole
 from dreamer.training import checkpoint, parallel, seeds
 from dreamer.training.first_state import check_seed, first_state, fits, save_state
-from dreamer.training.metrics_log import Log, Meter, MetricsFn, evaluated, headline
+from dreamer.training.metrics_log import Log, Meter, MetricsFn, evaluated, headline, named_figures
 from dreamer.training.programs import Place, Programs, compiled, in_thread
 from dreamer.training.progress import Progress
 from dreamer.types import FunctionalEnv, Params
@@ -120,8 +122,14 @@ class TrainingOptions:
     announce: Callable[[str], None] = lambda text: None
     """Gets a line when something begins that takes long: compilation, the training, the last checkpoint."""
 
+    def __post_init__(self) -> None:
+        whole("TrainingOptions.eval_every", self.eval_every, 1)
+        for name in ("checkpoint_every_s", "log_every_s", "time_limit_s"):
+            value = getattr(self, name)
+            if value is not None or name == "log_every_s":
+                check_duration(f"TrainingOptions.{name}", value)
 
-@alone
+
 def train(
     env: FunctionalEnv,
     config: DreamerConfig,
@@ -152,9 +160,20 @@ def train(
         ValueError: environment and configuration do not fit, the checkpoint does not belong to them or to the seed, a
             replay in the host's memory is asked for with several seeds or devices, or another process trains there.
     """
-    out = Path(out)
+    check_kind("env", env, FunctionalEnv, "dreamer.from_gym makes one of a Gymnasium environment.")
+    check_kind("config", config, DreamerConfig, "dreamer.preset('cpu') is one.")
+    check_kind("options", options, TrainingOptions, "Give TrainingOptions(...).")
+    check_fit(env, config, total_steps)
+    return _train(env, config, Path(out), int(total_steps), as_seeds(seed), options)
+
+
+@alone
+def _train(
+    env: FunctionalEnv, config: DreamerConfig, out: Path, total_steps: int, seed: int | list[int],
+    options: TrainingOptions,
+) -> TrainResult:  # fmt: skip
+    """`train` with checked arguments."""
     check_seed(out, seed, options.resume)
-    out.mkdir(parents=True, exist_ok=True)
     mesh = parallel.make_mesh(options.devices, env.num_envs, config.batch_size) if options.devices else None
     if mesh is not None and not isinstance(seed, int):
         raise ValueError(f"seed = {seed}: several seeds run in one program on one device. Give one, or no devices.")
@@ -374,8 +393,8 @@ class _Run:
                     break
                 if self._ready is not None:
                     wait([self._ready])
-                figures = self.options.eval_fn(params, line["env_steps"])
-                line |= {f"eval/{name}": float(value) for name, value in figures.items()}
+                figures = named_figures(self.options.eval_fn(params, line["env_steps"]))
+                line |= {f"eval/{name}": value for name, value in figures.items()}
                 self._bar.note(evaluated(figures))
             self._log.write(line)
             self._waiting.pop(0)  # interrupted just before, the line is written twice and read once

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from dreamer.spaces import ActionSpec, ObsShape
+from dreamer.refusals import INT32, check_same, kind_of, whole
+from dreamer.spaces import ActionSpec, ObsShape, actions, check, image_shape
 
 EnvState = Any
 Params = dict[str, Any]
@@ -63,3 +66,50 @@ class FunctionalEnv:
     """state, action -> state and next frames; actions are (N, A) in [-1, 1], or classes (N,) int32."""
     mirror: Mirror | None = None
     """A symmetry that `DreamerConfig.mirror` learns from; None: there is none."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for instances, observations, actions or functions of another kind."""
+        whole("FunctionalEnv.num_envs", self.num_envs, 1, INT32)
+        image_shape(self.obs_shape)
+        actions(self.action_dim)
+        for name in ("reset", "step"):
+            if not callable(getattr(self, name)):
+                raise ValueError(f"FunctionalEnv.{name} = {getattr(self, name)!r}: it must be a function. Correct it.")
+
+    def begin(self, key: jax.Array) -> tuple[EnvState, Transition]:
+        """`reset`.
+
+        Raises:
+            ValueError: it returns something else than the learner reads.
+        """
+        state, transition = self._pair("reset", self.reset(key))
+        return state, transition
+
+    def advance(self, state: EnvState, action: jax.Array) -> tuple[EnvState, Transition]:
+        """`step`, for actions (N, A) in [-1, 1] or classes (N,).
+
+        Raises:
+            ValueError: it returns something else than the learner reads, or another kind of state than it got.
+        """
+        after, transition = self._pair("step", self.step(state, action))
+        check_same("the state of the environment: ", state, after)
+        return after, transition
+
+    def _pair(self, name: str, returned: Any) -> tuple[EnvState, Transition]:
+        """What `reset` or `step` has returned, checked for what is known while it is traced: shapes and types."""
+        if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], Transition)):
+            raise ValueError(f"FunctionalEnv.{name} returns a {type(returned).__name__}; it must return the state and "
+                             "a Transition. Correct it.")
+        state, transition = returned
+        check(self.obs_shape, transition.obs, self.num_envs)
+        if not isinstance(transition.metrics, dict):
+            raise ValueError(f"FunctionalEnv.{name}: metrics is {transition.metrics!r}; it must be a dict of arrays "
+                             f"({self.num_envs},) by name, {{}} for none. Correct it.")
+        flags = {flag: getattr(transition, flag) for flag in ("is_first", "is_last", "is_terminal")}
+        for part, value in {"reward": transition.reward, **flags, **transition.metrics}.items():
+            kinds = (np.bool_,) if part in flags else (np.bool_, np.integer, np.floating)
+            found = getattr(value, "dtype", np.dtype(object))
+            if np.shape(value) != (self.num_envs,) or not any(jnp.issubdtype(found, kind) for kind in kinds):
+                raise ValueError(f"FunctionalEnv.{name}: {part} is {kind_of(value)}; it must be an array of "
+                                 f"{'bool' if part in flags else 'numbers'}, shape ({self.num_envs},). Correct it.")
+        return state, transition

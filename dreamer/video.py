@@ -22,7 +22,7 @@ from dreamer.types import FunctionalEnv, Params
 def play(env: FunctionalEnv, config: DreamerConfig, params: Params, key: jax.Array, steps: int) -> dict[str, Any]:
     """What the instances see and do: obs (T, N, ...), prev_action (T, N, A), is_first (T, N), from the first frame."""
     reset_key, run_key = jax.random.split(key)
-    state, transition = env.reset(reset_key)
+    state, transition = env.begin(reset_key)
     carry, actions = agent.init_carry(config, env.num_envs, env.action_dim), spaces.actions(env.action_dim)
 
     def one(loop: tuple, step_key: jax.Array) -> tuple[tuple, dict[str, Any]]:
@@ -30,7 +30,7 @@ def play(env: FunctionalEnv, config: DreamerConfig, params: Params, key: jax.Arr
         seen = {"obs": transition.obs, "prev_action": carry["action"], "is_first": transition.is_first}
         choice = agent.Choice(step_key)
         carry, action = agent.act(config, params, carry, transition.obs, transition.is_first, choice)
-        state, transition = env.step(state, actions.to_env(action))
+        state, transition = env.advance(state, actions.to_env(action))
         return (state, transition, carry), seen
 
     return jax.lax.scan(one, (state, transition, carry), jax.random.split(run_key, steps))[1]

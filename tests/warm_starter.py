@@ -80,6 +80,8 @@ def run(request: dict) -> None:
     if request["largest"] is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (request["largest"], resource.RLIM_INFINITY))
     sys.argv = [request["start"], *request["words"]]
+    for number in SIGNALS:  # a signal that comes after the work, when the command listens no more, changes nothing
+        signal.signal(number, lambda *_: None)
     listen()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     code = 0

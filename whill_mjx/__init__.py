@@ -5,8 +5,13 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+if sys.argv[:1] == ["-m"] and sys.path[:1] == [os.getcwd()]:
+    sys.path.append(sys.path.pop(0))  # of a command: a user's random.py or json.py must not stand for Python's own
 
 if TYPE_CHECKING:
     from whill_mjx.batch import make_batch as make_batch

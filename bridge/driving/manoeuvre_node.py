@@ -14,7 +14,7 @@ from bridge.driving.vehicle_node import VehicleNode
 from bridge.driving.vehicle_time import VehicleTime
 from bridge.nodes import ros
 from bridge.recording.record_node import RecordNode
-from bridge.recording.trial_writer import TrialWriter
+from bridge.recording.trial_writer import TrialWriter, left_out
 
 
 class ManoeuvreNode(VehicleNode):
@@ -91,6 +91,8 @@ class ManoeuvreNode(VehicleNode):
             if self.player.driven > self._driven_before:
                 self.trials.append(writer.close())
                 self.node.get_logger().info(f"{self.trials[-1]}: rows {writer.rows}")
+                for line in left_out(writer.left_out):
+                    self.node.get_logger().warning(line)
             else:
                 aside = writer.put_aside()
                 self.node.get_logger().warning(f"stopped on the way; what was recorded is in {aside}")

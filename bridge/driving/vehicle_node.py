@@ -83,6 +83,10 @@ class VehicleNode:
         self.node, self.decider, self.options, self.now = node, decider, options, now
         self.supervisor, self.name = decider.supervisor, ros.full_name(node)
         self.commands = CommandTopic(node, options.command_topic, options.command_type, self._on_command)
+        for topic in options.yield_to:
+            if node.resolve_topic_name(topic) == self.commands.name:
+                raise OptionError(f"--yield-to {topic}: is the command topic {self.commands.name}, on which this node "
+                                  "would yield to itself. It yields there to others anyway: leave the topic out.")
         self._drivers = [CommandListener(node, topic, "auto", self._on_driver) for topic in options.yield_to]
         self.guard = GuardLink(uuid.uuid4().hex, self.commands.name,
                                self._start_guard if options.guard == "own" else None, isinstance(now, VehicleTime))

@@ -129,6 +129,15 @@ def choose_type(listeners: list[Endpoint]) -> str:
     return min(kinds, default="", key=list(TYPES.values()).index)
 
 
+def finite_command(node: Any, topic: str, v: float, omega: float) -> tuple[float, float]:
+    """Return a command to a base of ours, v [m/s] and omega [rad/s]; zero, and a warning, where it is not finite."""
+    if math.isfinite(v) and math.isfinite(omega):
+        return v, omega
+    node.get_logger().warning(f"{node.resolve_topic_name(topic)}: a command v {v:g} m/s, omega {omega:g} rad/s is not "
+                              "finite and counts as zero: correct its sender", throttle_duration_sec=1.0)
+    return 0.0, 0.0
+
+
 class CommandListener:
     """Hears the commands on a topic, whatever their type and quality of service.
 

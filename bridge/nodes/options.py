@@ -13,22 +13,31 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn
 
+from bridge.nodes import signals
 from bridge.nodes.exits import Exit
 
 
 def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
-    """Let a command's `main` return `Exit.STOPPED` after one line where Ctrl-C comes before or after its node spins."""
+    """Let a command's `main` return `Exit.STOPPED` after one line where a signal ends it before its node runs."""
 
     @wraps(main)
     def guarded(arguments: list[str] | None = None) -> int:
-        try:
-            return main(arguments)
-        except KeyboardInterrupt:
-            name = getattr(main.__globals__.get("__spec__"), "name", "bridge")
-            print(f"{name}: stopped (SIGINT)", file=sys.stderr)
-            return Exit.STOPPED
+        with signals.heard(interrupt=True) as heard:
+            try:
+                return main(arguments)
+            except BaseException as error:  # an import may make an ImportError of it
+                if not (heard or isinstance(error, KeyboardInterrupt)):
+                    raise
+                which = signals.name_of(heard[0]) if heard else "SIGINT"
+        name = getattr(main.__globals__.get("__spec__"), "name", "bridge")
+        print(f"{name}: stopped ({which})", file=sys.stderr)
+        return Exit.STOPPED
 
     return guarded
+
+
+NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|-inf$")
+"""Words that are numbers below zero, and no options."""
 
 
 class WithDefaults(argparse.HelpFormatter):
@@ -44,11 +53,15 @@ class WithDefaults(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """An `argparse.ArgumentParser` whose complaint is one line, without the usage; it takes no empty words."""
+    """An `argparse.ArgumentParser` whose complaint is one line, without the usage; it takes no empty words.
+
+    Options are written out: an abbreviation would not be seen to be given twice, or to win over a ROS parameter.
+    """
 
     def __init__(self, *, formatter_class: type[argparse.HelpFormatter] = WithDefaults, **more: Any) -> None:
         """As argparse's, with `prog` as complaints name it: a module such as `bridge.drive`, or what is typed."""
-        super().__init__(formatter_class=formatter_class, **more)
+        super().__init__(formatter_class=formatter_class, allow_abbrev=False, **more)
+        self._negative_number_matcher = NEGATIVE  # argparse's own takes -1e-05 and -inf for options
 
     def _get_formatter(self) -> argparse.HelpFormatter:
         typed = self.prog if self.prog.startswith("python") else f"python -m {self.prog}"
@@ -79,12 +92,16 @@ class Parser(argparse.ArgumentParser):
 
 
 def in_range(
-    low: float = -math.inf, high: float = math.inf, kind: type[int] | type[float] = float, infinite: bool = False
+    low: float = -math.inf, high: float = math.inf, kind: type[int] | type[float] = float, infinite: bool = False,
+    above: bool = False,
 ) -> Callable[[str], float]:
     """A type for `add_argument`: a number from `low` to `high`, finite unless `infinite` is set.
 
     Args:
+        low, high: ends of the range.
         kind: int for whole numbers.
+        infinite: allow inf.
+        above: leave `low` out, as of an age that nothing keeps at zero.
     """
 
     def read(text: str) -> float:
@@ -92,8 +109,8 @@ def in_range(
             value = kind(text)
         except ValueError:
             raise argparse.ArgumentTypeError(f"{text!r} is not a {'whole ' if kind is int else ''}number") from None
-        if not low <= value <= high or not (infinite or math.isfinite(value)):
-            ends = [("at least", low), ("at most", high)]
+        if not low <= value <= high or above and value == low or not (infinite or math.isfinite(value)):
+            ends = [("above" if above else "at least", low), ("at most", high)]
             rule = " and ".join(f"{word} {end:g}" for word, end in ends if math.isfinite(end))
             raise argparse.ArgumentTypeError(f"{text} must be {rule or 'finite'}")
         return value

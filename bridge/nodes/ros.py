@@ -8,16 +8,16 @@ import importlib
 import json
 import math
 import os
-import signal
+import re
 import sys
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-from bridge.nodes import scheduling
+from bridge.nodes import scheduling, signals
+from bridge.nodes.exits import Exit, OptionError
 
 # All names are relative, so a namespace or a remapping moves them: two bridges on one graph never share a topic.
 IMAGE_TOPIC = "sensing/camera/front/image_raw"
@@ -295,24 +295,63 @@ def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bo
         arguments: `--ros-args ...` of the command line, or empty.
         realtime: SCHED_FIFO priority of this process and its DDS threads; 0 leaves the normal scheduling.
         managed: make it a lifecycle node.
+
+    Raises:
+        SystemExit: ROS is missing, its arguments cannot be understood, or it does not start; or OptionError in the
+            block, whose line is printed.
+        KeyboardInterrupt: one of the signals came before the node was there.
     """
-    if realtime:
-        scheduling.set_realtime(name, realtime)
+    with signals.heard() as stopping:
+        if realtime:
+            scheduling.set_realtime(name, realtime)
+        node = _join(name, arguments, managed)
+        try:
+            if stopping:
+                raise KeyboardInterrupt
+            try:
+                yield node
+            finally:
+                stopping.clear()  # `spin` has heeded them
+        except OptionError as error:  # one that shows only in the graph
+            print(f"{name}: {error}", file=sys.stderr)
+            raise SystemExit(int(Exit.REFUSED)) from None
+        finally:
+            import rclpy
+
+            node.destroy_node()
+            rclpy.try_shutdown()
+
+
+def _join(name: str, arguments: list[str], managed: bool) -> Any:
+    """Start ROS and return the node; arguments and errors as of `node_session`."""
     use_dds_profile()
     try:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
+        from rclpy.utilities import remove_ros_args
     except ImportError as error:
         raise SystemExit(f"{name}: {error}. The nodes need ROS 2 (Humble or newer) for Python. "
                          "Source your ROS installation, or run `pip install -e '.[ros]'` on x86-64.") from error
-    rclpy.init(args=[sys.argv[0], *arguments], signal_handler_options=SignalHandlerOptions.NO)
-    # no services to read and write parameters: each thing that the executor waits for makes every wait longer
-    node = managed_node(name) if managed else rclpy.create_node(name, start_parameter_services=False)
+    words = [sys.argv[0], *arguments]
     try:
-        yield node
-    finally:
-        node.destroy_node()
+        remove_ros_args(words)
+    except RuntimeError as error:
+        print(f"{name}: {' '.join(arguments)}: ROS does not understand it: {_plain(error)}. Correct it.",
+              file=sys.stderr)
+        raise SystemExit(int(Exit.REFUSED)) from None
+    try:
+        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+        # no services to read and write parameters: each thing that the executor waits for makes every wait longer
+        return managed_node(name) if managed else rclpy.create_node(name, start_parameter_services=False)
+    except Exception as error:  # of rclpy, which has many kinds
         rclpy.try_shutdown()
+        raise SystemExit(f"{name}: ROS does not start: {_plain(error)}. Correct what follows --ros-args, or the "
+                         "environment variable that it names (ROS_DOMAIN_ID, ROS_LOG_DIR, HOME).") from None
+
+
+def _plain(error: Exception) -> str:
+    """Return what an error of ROS says, in one line and without the place in its source."""
+    return " ".join(re.sub(r",? at \S+:\d+", "", str(error)).split()).rstrip(".")
 
 
 def make_executor() -> Any:
@@ -335,39 +374,24 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
 
     The node needs a timer, which bounds the reaction time. A SIGHUP that is ignored, as of `nohup`, stays so.
     """
-    stopping = []
-
-    def stop(number: int, _: FrameType | None) -> None:
-        stopping.append(number)
-
-    numbers = {signal.SIGTERM, signal.SIGINT}
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-        numbers.add(signal.SIGHUP)
-    before = {number: signal.signal(number, stop) for number in numbers}
-    executor = make_executor()
-    gc.collect()
-    gc.freeze()  # what is there by now stays, so no later collection looks through it and delays a command
-    executor.add_node(node)
-    try:
-        while not stopping and not done():
-            executor.spin_once(timeout_sec=0.1)
-    finally:
-        executor.remove_node(node)
-        executor.shutdown()
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with signals.heard() as stopping:
+        executor = make_executor()
+        gc.collect()
+        gc.freeze()  # what is there by now stays, so no later collection looks through it and delays a command
+        executor.add_node(node)
+        try:
+            while not stopping and not done():
+                executor.spin_once(timeout_sec=0.1)
+        finally:
+            executor.remove_node(node)
+            executor.shutdown()
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
     """Take no notice of further signals while a node says goodbye: an impatient second Ctrl-C would cut it short."""
-    before = {number: signal.signal(number, lambda *_: None)
-              for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
-    try:
+    with signals.heard():
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def spin_some(node: Any, seconds: float) -> None:
@@ -430,6 +454,22 @@ def stamp_seconds(stamp: Any) -> float:
     return stamp.sec + stamp.nanosec * 1e-9
 
 
+def yaw_of(q: Any) -> float:
+    """Return the yaw [rad] of a quaternion of any length; nan where it is no rotation.
+
+    All zeros are those of a message whose orientation was never set.
+    """
+    length = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z
+    if not 0 < length < math.inf:
+        return math.nan
+    return math.atan2(2 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+
+
+def is_measured(covariance: Any) -> bool:
+    """Return whether a quantity of sensor_msgs/Imu is measured: -1 in front of its covariance says that it is not."""
+    return bool(covariance[0] != -1)
+
+
 def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Split a command line into our arguments and those of ROS, of which each `--ros-args` ends at a `--`."""
     own: list[str] = []
@@ -446,10 +486,25 @@ def split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file in one piece."""
+    """Write a JSON file in one piece, or raise OSError and leave what was there."""
     temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(json.dumps(content) + "\n")
-    os.replace(temporary, path)
+    try:
+        temporary.write_text(json.dumps(content) + "\n")
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_results(program: str, path: Path, content: dict[str, Any]) -> bool:
+    """Write the results file of a node; where that fails, say so and return False: a drive goes on without it."""
+    try:
+        write_json(path, content)
+    except OSError as error:
+        print(f"{program}: --results {path}: {error.strerror}. The results are not written. Make room there, or choose "
+              "another place.", file=sys.stderr)
+        return False
+    return True
 
 
 def full_name(node: Any) -> str:

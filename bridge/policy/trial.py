@@ -94,7 +94,7 @@ class Trial:
             raise PolicyFileError(f"{name}: {answer.removeprefix(BAD)}. {EXPORT_AGAIN}.")
         if answer == LATE or code == -getattr(signal, "SIGPROF", 0):
             raise PolicyFileError(f"{name}: a first step is not done after {allowed}. A step "
-                                  "must be much shorter than a control period. {EXPORT_AGAIN}.")
+                                  f"must be much shorter than a control period. {EXPORT_AGAIN}.")
         problem = (answer or errors[-500:]).strip() or f"the process of its trial step ended with code {code}"
         raise PolicyFileError(f"{name}: onnxruntime refuses it: {problem}. It must hold standard operators that this "
                               f"runtime knows, and a step must fit in {request['memory']} bytes. {EXPORT_AGAIN}, or "
@@ -108,7 +108,7 @@ def leave_realtime() -> None:
 
 
 def main() -> None:
-    """Answer one trial: the request as a line of JSON and the network come in. The time granted and the answer go out."""
+    """Answer one trial: the request as a line of JSON and the network come in; time granted and answer go out."""
     leave_realtime()
     import onnxruntime
 
@@ -165,7 +165,7 @@ def _compare(kind: str, wanted: list[Tensor], found: list[Tensor]) -> None:
 
 
 def _limit(seconds: float, memory: int) -> None:
-    """Let the system end this process after `seconds` of processor time, and refuse it more memory than that [bytes]."""
+    """Let the system end this process after `seconds` of processor time, and refuse it more `memory` [bytes]."""
     try:
         import resource
     except ImportError:

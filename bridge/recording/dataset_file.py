@@ -1,6 +1,7 @@
 """What dataset.toml says of a recorded dataset: its options, and the file, which is written once."""
 
 import argparse
+import errno
 import os
 from pathlib import Path
 
@@ -37,7 +38,9 @@ def add_dataset_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_dataset(dataset: Path) -> None:
-    """Raise OptionError for a folder that holds somebody's files and no dataset."""
+    """Raise OptionError for a folder that holds somebody's files and no dataset, NotADirectoryError for a file."""
+    if dataset.exists() and not dataset.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(dataset / "trials"))
     if dataset.is_dir() and not (dataset / "dataset.toml").exists():
         others = sorted(one.name for one in dataset.iterdir() if one.name != "trials" and not one.name.startswith("."))
         if others:

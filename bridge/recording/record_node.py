@@ -146,7 +146,8 @@ class RecordNode:
     def _on_imu(self, message: Any) -> None:
         stamp = ros.stamp_seconds(message.header.stamp)
         t = self._time(stamp)
-        self._write(lambda writer: writer.imu(t, message.angular_velocity.z, stamp))
+        gyro = message.angular_velocity.z if ros.is_measured(message.angular_velocity_covariance) else math.nan
+        self._write(lambda writer: writer.imu(t, gyro, stamp))
 
     def _write(self, write: Callable[[Any], None]) -> None:
         """Write, and end the recording where that fails; the vehicle's nodes are other processes and drive on."""
@@ -175,7 +176,6 @@ def message_class(name: str) -> Any:
 
 
 def planar_pose(message: Any) -> tuple[float, float, float]:
-    """Return x [m], y [m], yaw [rad] of nav_msgs/Odometry."""
-    position, q = message.pose.pose.position, message.pose.pose.orientation
-    yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-    return position.x, position.y, yaw
+    """Return x [m], y [m], yaw [rad] of nav_msgs/Odometry; the yaw is nan where the message has no orientation."""
+    position = message.pose.pose.position
+    return position.x, position.y, ros.yaw_of(message.pose.pose.orientation)

@@ -11,24 +11,25 @@ def recover(dataset: Path) -> list[Path]:
     """Give the recordings of killed recorders their place as trials; return their folders.
 
     Raises:
-        ValueError: a trial of that name exists already.
+        ValueError: a trial of that name exists already, or two recordings have one name; then none is touched.
     """
-    found = []
+    places: dict[Path, Path] = {}
     for partial in sorted(dataset.glob(".*.partial-*")):
         match = PARTIAL.fullmatch(partial.name)
         if match is None or is_running(int(match["process"])):
             continue
         folder = dataset / "trials" / match["trial"]
-        if folder.exists():
+        if folder.exists() or folder in places:
             raise ValueError(f"{partial}: cannot become {folder}, which exists already. Rename one of them.")
+        places[folder] = partial
+    for folder, partial in places.items():
         folder.parent.mkdir(parents=True, exist_ok=True)
         for path in partial.glob("*.csv"):
             drop_torn_row(path)
         for path in partial.glob(MCAP):
             mend(path)
         os.replace(partial, folder)
-        found.append(folder)
-    return found
+    return list(places)
 
 
 def drop_torn_row(path: Path) -> None:

@@ -73,6 +73,8 @@ class SplitWriter:
         TrialWriter.check(dataset, f"{stem}_0")
         self.rows: Counter[str] = Counter(dict.fromkeys(COLUMNS, 0))
         """Of all whole trials."""
+        self.left_out: Counter[str] = Counter()
+        """Of all whole trials, as of `TrialWriter`."""
         self.trials: list[Path] = []
         self._dataset, self._stem, self._seconds, self._on_trial, self._clock = dataset, stem, seconds, on_trial, clock
         self._writer: TrialWriter | None = None
@@ -118,6 +120,7 @@ class SplitWriter:
         folder = writer.close()
         self.trials.append(folder)
         self.rows.update(writer.rows)
+        self.left_out.update(writer.left_out)
         self._on_trial(folder, writer.rows)
         return folder
 

@@ -5,7 +5,7 @@ import itertools
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -22,6 +22,12 @@ MCAP = "recording.mcap"
 """File of a trial with the whole messages of all topics."""
 TRIAL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
 PARTIAL = re.compile(r"\.(?P<trial>[A-Za-z0-9][\w.-]*)\.partial-(?P<process>\d+)")
+
+
+def left_out(counts: Mapping[str, int]) -> list[str]:
+    """Return a sentence for each stream of which measurements were left out, by how many."""
+    return [f"{stream}: {count} messages were left out: a number is not finite, an orientation is all zeros, or an "
+            "IMU measures no yaw rate. Correct the publisher." for stream, count in counts.items() if count]
 
 
 class TrialWriter:
@@ -49,6 +55,8 @@ class TrialWriter:
         self._first_pose: tuple[float, float, float] | None = None
         self._yaw: float | None = None
         self.rows = dict.fromkeys(COLUMNS, 0)
+        self.left_out = dict.fromkeys(COLUMNS, 0)
+        """Measurements with a number that is not finite: a log holds no holes."""
 
     @staticmethod
     def check(dataset: str | Path, trial: str) -> Path:
@@ -89,6 +97,8 @@ class TrialWriter:
         """
         if self._is_early("odometry", t):
             return
+        if not self._is_finite("odometry", t, *pose, *twist, stamp):
+            return  # before its pose becomes the origin, or the heading that all later ones go on from
         x, y, yaw = pose
         if self._first_pose is None or self._yaw is None:
             self._first_pose, self._yaw = (x, y, yaw), yaw
@@ -147,6 +157,17 @@ class TrialWriter:
         os.replace(self._partial, self.folder)
         return self.folder
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was recorded so far."""
+        return not self._files and self._mcap is None
+
+    def drop(self) -> None:
+        """End a recording that is empty, and leave no trial: the dataset could not be read with it."""
+        self._partial.rmdir()
+        with contextlib.suppress(OSError):
+            self.folder.parent.rmdir()  # where it holds no other trial
+
     def put_aside(self) -> Path:
         """End a recording that is no trial, such as a stopped drive; return its folder, below `aborted` in the dataset.
 
@@ -166,9 +187,15 @@ class TrialWriter:
         since = round(t - self._origin, 6)
         return since < 0 or since <= self._last.get(stream, -math.inf)
 
+    def _is_finite(self, stream: str, *values: float) -> bool:
+        """Return whether all numbers of a measurement are finite; count one that is not."""
+        finite = all(map(math.isfinite, values))
+        self.left_out[stream] += not finite
+        return finite
+
     def _add(self, stream: str, t: float, *values: float) -> None:
-        if not all(math.isfinite(value) for value in (t, *values)):
-            return  # a log holds measurements; a fit cannot use a hole with a number's name
+        if not self._is_finite(stream, t, *values):
+            return
         if stream not in self._files:
             self._files[stream] = open(self._partial / f"{stream}.csv", "w", encoding="utf-8")
             self._files[stream].write(",".join(COLUMNS[stream]) + "\n")

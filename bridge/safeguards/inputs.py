@@ -120,7 +120,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="std_msgs/Bool on enable; require: stand unless it says true now")
     parser.add_argument("--dead-man-button", type=whole(-1, 1000), default=-1, metavar="INDEX",
                         help="sensor_msgs/Joy on joy: stand unless this button is held; -1: none")
-    parser.add_argument("--signal-age", type=in_range(0, infinite=True), default=0.5,
+    parser.add_argument("--signal-age", type=in_range(0, infinite=True, above=True), default=0.5,
                         help="a signal that is older is unknown [s]")
     parser.add_argument("--collision", choices=("latch", "release", "ignore"), default="latch",
                         help="on collision_sensor true: stop until re-armed, stop while it lasts, or take no notice")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import math
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -106,14 +105,18 @@ def _scan(message: Any, sensor: SensorInput) -> Reading:
 
 
 def _pose(message: Any) -> np.ndarray:
-    q, p = message.pose.pose.orientation, message.pose.pose.position
-    yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-    twist = message.twist.twist
-    return numbers(p.x, p.y, yaw, twist.linear.x, twist.angular.z).astype(np.float64)
+    p, twist = message.pose.pose.position, message.twist.twist
+    values = p.x, p.y, ros.yaw_of(message.pose.pose.orientation), twist.linear.x, twist.angular.z
+    numbers(*values)  # an orientation of zeros is none, and has no yaw
+    return np.array(values)  # not rounded: far from the origin of a map float32 has steps of half a metre
 
 
 def _imu(message: Any) -> Reading:
     force, turn = message.linear_acceleration, message.angular_velocity
+    if not (ros.is_measured(message.linear_acceleration_covariance)
+            and ros.is_measured(message.angular_velocity_covariance)):
+        raise SenseError("the message says by a covariance of -1 that it measures no specific force or no angular "
+                         "velocity, and the policy needs both. Name an IMU that measures them.")
     return _counted(numbers(force.x, force.y, force.z, turn.x, turn.y, turn.z))
 
 

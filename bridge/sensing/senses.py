@@ -50,10 +50,14 @@ def rays_of(scan: Scan, sensor: SensorInput) -> np.ndarray:
         SenseError: the scan is damaged, or does not look where a ray of the policy does.
     """
     ranges, step = np.asarray(scan.ranges, np.float32), scan.angle_increment
+    if not (math.isfinite(scan.range_min) and scan.range_min >= 0):
+        raise SenseError(f"range_min of the scan is {scan.range_min:g} m; it must be a finite distance. Correct the "
+                         "publisher.")
     if not (len(ranges) and math.isfinite(step) and step and math.isfinite(scan.angle_min)):
         raise SenseError(f"scan of {len(ranges)} beams, {step:g} rad apart from {scan.angle_min:g} rad: there must be "
                          "some, at an angle. Correct the publisher.")
-    if not ((ranges >= scan.range_min) | (ranges == -np.inf)).any():  # a wide hall has inf, a hung scanner zeros
+    # a wide hall has inf, a hung scanner zeros, also one that states no least range
+    if not ((ranges > 0) & (ranges >= scan.range_min) | (ranges == -np.inf)).any():
         raise SenseError(f"scan without a single valid range (all are below {scan.range_min:g} m or no numbers): the "
                          "scanner is blind. Check it.")
     rays, fov = sensor.shape[0], float(sensor.settings.get("fov", FULL_TURN))
@@ -69,8 +73,8 @@ def rays_of(scan: Scan, sensor: SensorInput) -> np.ndarray:
         raise SenseError(f"the scan looks from {ends[0]:.2f} to {ends[1]:.2f} rad, and the policy needs {-fov / 2:.2f} "
                          f"to {fov / 2:.2f}. Take a scanner that sees as much, or train with this one's fov.")
     found = ranges[index]
-    near, far = scan.range_min, scan.range_max if scan.range_max > 0 else math.inf
-    shown = np.where((found >= near) & (found <= far), found, reach)
+    near, far = min(scan.range_min, reach), scan.range_max if scan.range_max > 0 else math.inf
+    shown = np.where((found >= scan.range_min) & (found <= far), found, reach)
     return np.where(found == -np.inf, near, np.minimum(shown, reach)).astype(np.float32)
 
 
@@ -78,12 +82,14 @@ def numbers(*values: float) -> np.ndarray:
     """Return finite numbers as (N,) float32.
 
     Raises:
-        SenseError: one of them is not finite.
+        SenseError: one of them is not finite, or too large for float32.
     """
-    found = np.array(values, np.float64)
+    with np.errstate(over="ignore"):
+        found = np.array(values, np.float64).astype(np.float32)
     if not np.isfinite(found).all():
-        raise SenseError(f"values {np.array2string(found, precision=3)} are not all finite. Correct the publisher.")
-    return found.astype(np.float32)
+        raise SenseError(f"values {', '.join(f'{value:g}' for value in values)} are not all finite. Correct the "
+                         "publisher.")
+    return found
 
 
 class Stream:

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -77,8 +78,7 @@ def read_calibration(path: str | Path) -> Calibration:
     def numbers(name: str, allowed: tuple[int, ...]) -> tuple[float, ...]:
         part = table.get(name)
         data = part.get("data") if isinstance(part, Mapping) else None
-        if not (isinstance(data, list) and len(data) in allowed and all(
-                isinstance(one, int | float) and math.isfinite(one) for one in data)):
+        if not (isinstance(data, list) and len(data) in allowed and all(map(_is_number, data))):
             raise ValueError(f"{path}: {name}.data must be {' or '.join(map(str, allowed))} finite numbers. {remedy}")
         return tuple(float(one) for one in data)
 
@@ -87,7 +87,7 @@ def read_calibration(path: str | Path) -> Calibration:
             raise ValueError(f"{path}: {name} is {str(table.get(name))[:40]}; it must be a whole number from 1 to 8192."
                              f" {remedy}")
     model = table.get("distortion_model")
-    if model not in MODELS:
+    if not isinstance(model, str) or model not in MODELS:
         raise ValueError(f"{path}: distortion_model is {str(model)[:40]!r}; it must be one of {', '.join(MODELS)}. "
                          "Calibrate with one of them.")
     matrix = numbers("camera_matrix", (9,))
@@ -97,6 +97,12 @@ def read_calibration(path: str | Path) -> Calibration:
                          f"{remedy}")
     return Calibration(table["image_width"], table["image_height"], (fx, fy, cx, cy), model,
                        numbers("distortion_coefficients", MODELS[model]))
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a value of a YAML file is a finite number; its whole numbers may have any number of digits."""
+    largest = sys.float_info.max
+    return isinstance(value, int | float) and not isinstance(value, bool) and -largest <= value <= largest
 
 
 class Rectifier:
@@ -188,6 +194,8 @@ def view_of(pacer: SensorInput, crop: Crop | None = None, calibration: Path | No
                               "paces it). Leave them out.")
         return None
     size = pacer.size
+    if crop is not None and not (crop[2] and crop[3]):
+        raise OptionError(f"--crop {' '.join(map(str, crop))}: HEIGHT and WIDTH must be at least 1. Correct them.")
     if calibration is None:
         return View(size, crop)
     if crop is not None:

@@ -1,7 +1,6 @@
 """Serves one simulated vehicle on the ROS graph: its topics, its time, its episodes."""
 
 import argparse
-import math
 import threading
 import time
 from collections import deque
@@ -11,6 +10,7 @@ from typing import Any
 from bridge.driving.bases import WHILL
 from bridge.episodes import PROTOCOL, Calls, number, whole
 from bridge.nodes import ros
+from bridge.nodes.commands import finite_command
 from bridge.policy import pacer_of
 from bridge.sensing.sense_topics import message_of, topics_of
 from bridge.simulation.simulated import Episode, Frame, SimulatedClock, SimulatedVehicle, enlarge, halfway
@@ -44,9 +44,6 @@ class SimulateNode:
         from std_msgs.msg import Bool, Header
 
         log = node.get_logger()
-        log.info("compiling the simulator: up to a minute where it has not run before")
-        vehicle.reset(options.seed)
-        vehicle.step(0.0, 0.0)  # compiles, where the simulator does; before anybody waits for frames
         self.node, self.vehicle, self.options = node, vehicle, options
         self.clock = SimulatedClock(options.speed, options.clock)
         self._bool, self._header = Bool, Header
@@ -101,7 +98,8 @@ class SimulateNode:
     def _on_command(self, message: Any) -> None:
         now = time.monotonic()
         planar = message.twist if self.options.command_type == "TwistStamped" else message
-        self.command_log.append((now, planar.linear.x, planar.angular.z))
+        v, omega = finite_command(self.node, ros.COMMAND_TOPIC, planar.linear.x, planar.angular.z)
+        self.command_log.append((now, v, omega))
         if self._asked is not None:
             self.delays.append((self._asked, now - self._asked))
             self._asked = None
@@ -240,16 +238,16 @@ class SimulateNode:
         if len(self.episodes) == self.options.episodes and not self.stepped:
             self.finished_at = time.monotonic()
         if self.options.results and not self.stepped:
-            ros.write_json(self.options.results, self.results())
+            ros.write_results("bridge.simulate", self.options.results, self.results())
         return stamp
 
     def _command(self) -> tuple[float, float]:
-        """Return the command in force: the last one, zero where it has expired or is not finite."""
+        """Return the command in force: the last one, zero where it has expired."""
         if not self.command_log:
             return 0.0, 0.0
         received, v, omega = self.command_log[-1]
         expired = time.monotonic() - received > WHILL.expiry / self.clock.speed
-        return (0.0, 0.0) if expired or not (math.isfinite(v) and math.isfinite(omega)) else (v, omega)
+        return (0.0, 0.0) if expired else (v, omega)
 
     def _stamped(self, frame_id: str) -> Any:
         """Return a header with the time of now."""

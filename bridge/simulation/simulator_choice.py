@@ -2,6 +2,8 @@
 
 import argparse
 import importlib
+import sys
+import traceback
 from typing import Any
 
 from bridge.nodes.exits import OptionError
@@ -10,6 +12,30 @@ from bridge.simulation.simulated import SimulatedVehicle
 
 SIMULATOR = "bridge.simulation.chair_simulator:ChairSimulator"
 """What `--simulator` names unless given."""
+
+
+def ready_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
+    """Return the simulator of `make_vehicle` after a first period, in which it compiles: nobody waits for frames yet.
+
+    Raises:
+        ValueError, FileNotFoundError: as of `make_vehicle`, or a simulator of the user's own ended in an error.
+    """
+    try:
+        vehicle = make_vehicle(options)
+        print("bridge.simulate: compiling the simulator: up to a minute where it has not run before", file=sys.stderr)
+        vehicle.reset(options.seed)
+        vehicle.step(0.0, 0.0)
+    except (ValueError, FileNotFoundError):
+        raise
+    except Exception as error:
+        if options.simulator == SIMULATOR:
+            raise
+        places = [f"{one.filename}, line {one.lineno}: " for one in traceback.extract_tb(error.__traceback__)
+                  if one.filename != __file__ and not one.filename.startswith("<")]
+        raise OptionError(f"--simulator {options.simulator}: {places[-1] if places else ''}{type(error).__name__}: "
+                          f"{error}. It must be MODULE:FACTORY, called with task and vehicle, and give what "
+                          "SimulatedVehicle says. Correct it.") from error
+    return vehicle
 
 
 def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:

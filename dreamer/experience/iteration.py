@@ -23,6 +23,7 @@ from dreamer.layers import sensors
 from dreamer.model import agent as agents
 from dreamer.model.agent import AgentState
 from dreamer.model.rssm import Latent
+from dreamer.refusals import INT32, check_same, whole
 from dreamer.training import parallel
 from dreamer.training.programs import compile_lowered
 from dreamer.types import Carry, EnvState, FunctionalEnv, Transition
@@ -66,8 +67,10 @@ class TrainState:
     """(N, A) of the actions; None where it has no memory."""
 
 
-def check_fit(env: FunctionalEnv, config: DreamerConfig) -> None:
-    """Raise ValueError where observation, mirror or pretraining do not fit; nothing is computed."""
+def check_fit(env: FunctionalEnv, config: DreamerConfig, total_steps: int = 0) -> None:
+    """Raise ValueError where observation, mirror, replay, pretraining or the run's length do not fit; nothing is
+    computed."""
+    whole("total_steps", total_steps, 0, INT32 - env.num_envs * config.steps_per_iter)
     worlds = 0 if env.mirror is None else env.mirror.worlds
     if config.mirror > worlds:
         raise ValueError(
@@ -75,6 +78,8 @@ def check_fit(env: FunctionalEnv, config: DreamerConfig) -> None:
             f"{worlds} other worlds: lower it, or give one."
         )
     sensors.check(config, env.obs_shape)
+    replay.rows_for(config, env.num_envs)
+    credit_rates(config, env.num_envs)
     needed = config.batch_length * env.num_envs
     if 0 < config.pretrain_steps <= needed:
         raise ValueError(
@@ -93,8 +98,7 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
     check_fit(env, config)
     zero = jnp.zeros((), jnp.int32)
     agent_key, env_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
-    env_state, transition = env.reset(env_key)
-    spaces.check(env.obs_shape, transition.obs, env.num_envs)
+    env_state, transition = env.begin(env_key)
     return TrainState(
         agent=agents.init_agent(config, env.obs_shape, env.action_dim, agent_key),
         env_state=env_state,
@@ -167,7 +171,8 @@ def collect(
         action = jnp.concatenate([real, others.reshape(-1, *real.shape[1:])])
     latent = Latent(carry["deter"], carry["stoch"])
     memory = replay.write(config, state.replay, frame, action, latent)
-    env_state, transition = env.step(state.env_state, actions.to_env(real))
+    env_state, transition = env.advance(state.env_state, actions.to_env(real))
+    check_same("the Transition: ", state.transition, transition)
     begun = transition.is_first
     episode_return = jnp.where(begun, 0.0, state.episode_return) + transition.reward
     episode_length = jnp.where(begun, 0, state.episode_length + 1)
@@ -258,9 +263,20 @@ def sum_over(
 
 
 def credit_rates(config: DreamerConfig, num_envs: int) -> tuple[int, int]:
-    """Credit earned by one step of all instances, and the price of one update, as whole numbers."""
+    """Credit earned by one step of all instances, and the price of one update, as whole numbers.
+
+    Raises:
+        ValueError: 32 bits do not hold them.
+    """
     ratio = Fraction(config.train_ratio).limit_denominator(round(1 / LEAST_TRAIN_RATIO))
-    return num_envs * ratio.numerator, config.replayed_per_update * ratio.denominator
+    gain, price = num_envs * ratio.numerator, config.replayed_per_update * ratio.denominator
+    if gain + price > INT32:
+        raise ValueError(
+            f"DreamerConfig.train_ratio = {config.train_ratio}: with {num_envs} instances and batches of "
+            f"{config.replayed_per_update} steps it is counted in parts too small for 32 bits. Round it, to "
+            f"{float(ratio):.0f} say, or use fewer instances or smaller batches."
+        )
+    return gain, price
 
 
 def compile_iteration(

@@ -90,6 +90,9 @@ def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | Non
         moment: of the training.
         rows: (path prefix, used rows, all rows): leaves below the prefix whose first axis has `all rows` are cut to the
             used ones, so that a replay that is not full costs no more than it holds.
+
+    Raises:
+        CheckpointError: parameters that are no finite numbers; earlier checkpoints stay.
     """
     import orbax.checkpoint as ocp
 
@@ -98,6 +101,7 @@ def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | Non
     env_steps, wall_s, pretraining = moment
     target = folder / (f"{env_steps:012d}.{pretraining:012d}" if pretraining else f"{env_steps:012d}")
     arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
+    _check_parameters(folder, arrays)
     if not parallel.is_first_process():
         return target
     temporary = folder / f"{UNFINISHED}{target.name}-{uuid.uuid4().hex}"  # an interrupted writer may still use its own
@@ -125,6 +129,20 @@ def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | Non
     for old in complete(folder)[:-KEEP]:
         shutil.rmtree(old, ignore_errors=True)
     return target
+
+
+def _check_parameters(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Refuse to keep a network that has diverged, in place of an earlier one that works."""
+    found = {name: array for name, array in arrays.items() if "params" in name.split(".")}
+    wrong = [name for name, array in found.items() if not np.isfinite(array.astype(np.float32)).all()]
+    if wrong:
+        there = ", ".join(path.name for path in complete(folder)) or "none"
+        raise CheckpointError(
+            f"{folder}: {len(wrong)} of {len(found)} arrays of parameters hold values that are no finite numbers (such "
+            f"as {wrong[0]}), so nothing is written. The training has diverged. Look for rewards or observations of "
+            "the environment that are NaN, infinite or very large, or lower the learning rate, and start in a new "
+            f"folder. Checkpoints from before, here: {there}."
+        )
 
 
 @contextmanager

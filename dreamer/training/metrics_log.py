@@ -110,6 +110,19 @@ class Log:
             self._board.close()
 
 
+def named_figures(figures: Any) -> dict[str, float]:
+    """What an evaluation function has returned, as numbers of Python.
+
+    Raises:
+        ValueError: something else than figures by name.
+    """
+    try:
+        return {str(name): float(value) for name, value in figures.items()}
+    except (AttributeError, TypeError, ValueError):
+        raise ValueError(f"TrainingOptions.eval_fn returned {figures!r}; it must return a dict of numbers by name, "
+                         "{} for none. Correct it.") from None  # fmt: skip
+
+
 def headline(line: dict[str, Any]) -> dict[str, str]:
     """The figures a watcher wants to see."""
     names = {

@@ -26,10 +26,12 @@ def make_mesh(devices: Sequence[jax.Device], instances: int, batch_size: int) ->
     """One axis over these devices; None for a single one, which needs no placement.
 
     Raises:
-        ValueError: the instances or the sequences of a batch do not split evenly.
+        ValueError: a device is there twice, or the instances or the sequences of a batch do not split evenly.
     """
     if len(devices) < 2 and jax.process_count() == 1:
         return None
+    if len(set(devices)) < len(devices):
+        raise ValueError(f"devices = {list(devices)}: one of them is there twice. Leave one out.")
     for count, what in ((instances, "instances"), (batch_size, "sequences of a batch")):
         if count % len(devices):
             raise ValueError(f"{count} {what} do not split evenly over {len(devices)} devices; change one of them.")

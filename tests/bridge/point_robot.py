@@ -14,7 +14,7 @@ class PointRobot:
 
     period = 0.1
     goal = 0.3
-    longest = 100
+    longest = 3000
     intrinsics = (60.0, 60.0, 32.0, 32.0)
     grid = Grid(np.array([[False, False, True], [False] * 3]), 0.5, -1.0, 0.0)
 

@@ -12,6 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.bridge_robot import Robot
@@ -50,10 +51,45 @@ SIGNAL_AGE = ("--signal-age", "20")
 """Of nodes that drive: on a busy machine an emergency stop may be silent for longer than the usual 0.5 s."""
 
 
-def commands_per_period(outcome, episode):
-    """Commands per image from the first motion of an episode on: before it a standing bridge is silent."""
-    within = [t for t, v, _ in outcome["commands"] if episode["began"] <= t <= episode["ended"] and v]
-    return len(within) / sum(within[0] <= t <= episode["ended"] for t in outcome["image_times"])
+def check_pace(outcome, episode):
+    """While an episode was driven, about one command came per image.
+
+    The usual gaps are compared: pauses of a busy machine, in which the vehicle stands, lengthen some of them.
+    """
+    driven = [t for t, v, _ in outcome["commands"] if episode["began"] <= t <= episode["ended"] and v]
+    usual = np.median(np.diff([t for t in outcome["image_times"] if driven[0] <= t <= driven[-1]]))
+    gaps = np.diff(driven)
+    assert np.median(gaps) >= usual / 2.3 and np.quantile(gaps, 0.25) <= usual / 0.3
+
+
+def taken_for_others(robot):
+    """Statuses by which a node of the bridge was taken for another commander.
+
+    Not those of a node whose name is not known yet: on a busy machine it may take long, and then it holds the vehicle.
+    """
+    nameless = "has other publishers: a node without a name;"
+    return [one for one in robot.statuses if "another node dr" in one["reason"]
+            or ("another node" in one["reason"] and nameless not in str(one["causes"]))]
+
+
+def wait_until(condition, told=lambda: "", seconds=WAIT):
+    """Wait for a condition and return its value; `told` says what there is where it does not come true."""
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, told()
+        time.sleep(0.05)
+    return value
+
+
+def send_until_disarmed(robot, publisher, make):
+    """Send a single command of another node. It is lost where the bridge has not found its sender yet: once more."""
+    for _ in range(40):
+        publisher.publish(make())
+        try:
+            return robot.wait_for_status(seconds=3, state="disarmed", reason="another node drove")
+        except AssertionError:
+            continue
+    pytest.fail(f"it did not yield: {robot.statuses[-3:]}")
 
 
 class Graph:
@@ -97,10 +133,13 @@ class Graph:
 
     def wait_for(self, name, text, seconds=WAIT):
         """Wait until a process has said something."""
-        end = time.monotonic() + seconds
-        while text not in self.log(name):
-            assert time.monotonic() < end and self.processes[name].poll() is None, f"{name}: {self.log(name)}"
-            time.sleep(0.05)
+        def said():
+            ended = self.processes[name].poll() is not None  # asked before the log is read: its last words count
+            there = text in self.log(name)
+            assert there or not ended, f"{name}: {self.log(name)}"
+            return there
+
+        wait_until(said, lambda: f"{name}: {self.log(name)}", seconds)
 
     def close(self):
         for peer in self.peers:
@@ -109,3 +148,14 @@ class Graph:
             if process.poll() is None:
                 process.kill()
                 process.wait()
+        for pid in self.left():  # guards that outlive their node: they would speak to the next test on this domain
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+    def left(self):
+        """Processes that those of this test have started and left: they have its folder in their environment."""
+        mark = f"ROS_LOG_DIR={self.environment['ROS_LOG_DIR']}\0".encode()
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            with contextlib.suppress(OSError):
+                if mark in path.read_bytes() + b"\0":
+                    yield int(path.parent.name)

@@ -11,6 +11,7 @@ pytestmark = pytest.mark.quick
 def test_a_domain_is_not_used_again_while_what_a_test_left_behind_may_still_speak(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(ros_graph.random, "randrange", lambda _: 6)
+    monkeypatch.setattr(ros_graph, "LINGER", 600.0)  # however slow the machine
     with ros_graph.free_domain() as one, ros_graph.free_domain() as other:
         assert (one, other) == (7, 8)
     with ros_graph.free_domain() as later:

@@ -118,7 +118,7 @@ def test_a_client_that_trickles_a_message_is_left(monkeypatch):
     server = EpisodeServer(CALLS)
     with socket.create_connection(("127.0.0.1", server.port), timeout=0.1) as connection:
         connection.sendall(struct.pack(">I", 1000))
-        for _ in range(100):
+        for _ in range(600):
             try:
                 connection.sendall(b" ")
                 if connection.recv(1) == b"":

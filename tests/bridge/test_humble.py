@@ -45,6 +45,15 @@ def test_modules_compile_under_python_3_10_where_there_is_one(tmp_path):
 
 START = """
 import json, sys, time, types
+clock = [100.0]
+def read():
+    clock[0] += 1e-5  # a loop that waits for a time ends
+    return clock[0]
+def sleep(seconds):
+    clock[0] += seconds
+# Before the modules that read them: in this time nothing is late, however busy the machine.
+time.monotonic = time.perf_counter = time.time = read
+time.sleep = sleep
 import humble_stub
 humble_stub.install()
 import numpy as np

@@ -1,8 +1,10 @@
 """Emergency stop, enable, dead-man button and collision sensor over real DDS, in both durabilities."""
 
+import re
 import time
 
 import pytest
+from ros_graph import taken_for_others
 
 from benchmarks.bridge_robot import message_type
 
@@ -41,11 +43,12 @@ def test_pulled_emergency_stop_ends_the_drive_until_it_is_released_and_armed(gra
     robot.wait_for_status(state="disarmed", reason="emergency stop", holds="emergency stop")
     robot.wait_until(lambda robot: robot.commands[-1][1:] == (0.0, 0.0))
     robot.arm()
-    graph.wait_for("drive", "not armed: emergency stop still holds")
+    # A pause of the guard may hold it too, and would be named in one line with the stop.
+    robot.wait_until(lambda _: re.search("not armed: .*emergency stop.* still holds", graph.log("drive")))
     state["pulled"] = False
     robot.wait_for_status(state="disarmed", holds="[]")
     robot.drive_again()
-    assert not any("another node" in status["reason"] for status in robot.statuses)
+    assert not taken_for_others(robot)
 
 
 def test_collision_that_a_best_effort_sensor_reports_stops_the_drive(graph, policy):
@@ -66,8 +69,13 @@ def test_emergency_stop_that_falls_silent_while_driving_stops_and_needs_arming(g
     robot = graph.peer("robot")
     beat = robot.whole()
     graph.start("drive", policy, "--signal-age", 2)
-    robot.wait_until(lambda robot: robot.moving())
-    beat.timer.cancel()
+    for _ in range(10):  # where a pause has stopped the drive before the silence does, it needs no arming: once more
+        robot.wait_until(lambda robot: robot.statuses and (robot.statuses[-1]["driving"]
+                                                           or robot.statuses[-1]["state"] == "disarmed"))
+        beat.timer.cancel()
+        if robot.wait_for_status(holds="emergency stop unknown")["state"] == "disarmed":
+            break
+        beat.timer.reset()
     robot.wait_for_status(state="disarmed", reason="emergency stop unknown")
     beat.timer.reset()
     robot.wait_for_status(state="disarmed", reason="emergency stop unknown", holds="[]")
@@ -88,7 +96,7 @@ def test_vehicle_moves_only_while_the_dead_man_button_is_held(graph, policy):
     joy = robot.publisher("sensor_msgs/Joy", "joy")
     buttons = [0, 0, 0]
     timer = robot.repeat(joy, 0.05, lambda: message_type("sensor_msgs/Joy")(buttons=buttons))
-    graph.start("drive", policy, "--dead-man-button", 2, "--signal-age", 3)
+    graph.start("drive", policy, "--dead-man-button", 2, "--signal-age", 3, "--e-stop", "ignore")
     robot.wait_for_status(reason="dead-man button released", holds="['dead-man button released']")
     buttons[2] = 1
     robot.wait_for_status(driving=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,14 @@ def tiny_config(**overrides: Any) -> DreamerConfig:
     return preset("cpu", **{**sizes, **overrides})
 
 
-def train_without_end(config: DreamerConfig, out: Path) -> None:
-    """Train in the corridor with a checkpoint after every iteration, until somebody ends it."""
-    options = TrainingOptions(progress=False, log_every_s=0.0, checkpoint_every_s=0.0)
+def train_without_end(config: DreamerConfig, out: Path, last: int) -> None:
+    """Train in the corridor with a checkpoint after every iteration, and from `last` steps on wait to be killed."""
+
+    def wait(line: dict[str, float]) -> None:
+        while line["env_steps"] >= last:
+            time.sleep(60)
+
+    options = TrainingOptions(progress=False, log_every_s=0.0, checkpoint_every_s=0.0, on_metrics=wait)
     train(corridor_env(4), config, out, 10**6, 0, options)
 
 

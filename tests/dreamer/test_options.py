@@ -155,7 +155,7 @@ def test_training_goes_on_while_an_evaluation_waits_for_its_compilation(tmp_path
     at_once, plain = run(tmp_path / "plain")
     assert at_once == [(16, False), (32, False), (48, False), (64, False)]
     monkeypatch.setattr("dreamer.train.Progress", Bar)
-    late, lines = run(tmp_path / "ahead", eval_ahead=lambda params: over.wait(60))
+    late, lines = run(tmp_path / "ahead", eval_ahead=lambda params: over.wait(600))
     assert late == [(16, True), (32, True), (48, True), (64, True)]
     assert lines == plain and len({size for _, size in lines}) > 1  # each of the parameters of its time
     assert stopped_at == [16, 32, 48, 64] * 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -93,7 +94,9 @@ def words_of(which, folder, out):
 
 
 def kept_steps(out):
-    return len(list((out / "steps").glob("[0-9]*.npz")))
+    with suppress(FileNotFoundError):  # the command may remove the folder at any moment
+        return len(list((out / "steps").glob("[0-9]*.npz")))
+    return 0
 
 
 def files_of(out):
@@ -118,7 +121,8 @@ def ended_again_and_again(start, which, folder, outs, kills, said):
     (module, *straight), (_, *words) = (words_of(which, folder, out) for out in outs)
     alone, broken = (partial(kept_steps, out) for out in outs)
     most, seconds = left_alone(start(module, straight, said), said, alone)
-    killed_again_and_again(partial(start, module, words, said), outs[1], kills, broken, most, seconds, said)
+    last = outs[1] / "report.json"
+    killed_again_and_again(partial(start, module, words, said), last, kills, broken, most, seconds, said)
     return module, words
 
 

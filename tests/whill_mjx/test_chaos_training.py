@@ -34,13 +34,16 @@ def log(out):
     return [{name: value for name, value in line.items() if not name.endswith("_s")} for line in lines]
 
 
-def straight_and_broken(start, module, words, kills, folder):
-    """Folders of a training that was left alone, and of one that was ended and begun again; another seed is refused."""
+def straight_and_broken(start, module, words, last, kills, folder):
+    """Folders of a training that was left alone, and of one that was ended and begun again; another seed is refused.
+
+    `last` is the name of a file that it writes at the end of its work.
+    """
     said, straight, broken = (folder / name for name in ("said", "straight", "broken"))
     alone = start(module, [*words, "--out", str(straight)], said)
     most, seconds = left_alone(alone, said, partial(steps_of, straight))
     again = partial(start, module, [*words, "--out", str(broken)], said)
-    killed_again_and_again(again, broken, kills, partial(steps_of, broken), most, seconds, said)
+    killed_again_and_again(again, broken / last, kills, partial(steps_of, broken), most, seconds, said)
     assert again().wait() == 0, said.read_text()
     assert start(module, [*words, "--out", str(broken), "--seed", "3"], said).wait() == 2
     assert "seed is 0 there and 3 here" in said.read_text()
@@ -50,7 +53,7 @@ def straight_and_broken(start, module, words, kills, folder):
 def test_a_training_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ["PYTHONPATH"]]))
     with Warm("half_lit") as warm:
-        straight, broken = straight_and_broken(warm.start, "half_lit", [], 3, tmp_path)
+        straight, broken = straight_and_broken(warm.start, "half_lit", [], "result.npz", 3, tmp_path)
     assert_same_arrays(straight / "result.npz", broken / "result.npz")
     assert log(broken) == log(straight)
     assert not [path for path in broken.rglob(".*") if path.name not in (".lock", ".training.lock")]
@@ -59,7 +62,8 @@ def test_a_training_killed_three_times_by_each_signal_ends_in_the_same_bits(tmp_
 @pytest.mark.long
 @pytest.mark.parametrize("learner", ["dreamer", "ppo"])
 def test_the_real_command_killed_ten_times_by_each_signal_ends_in_the_same_bits(learner, tmp_path):
-    straight, broken = straight_and_broken(Process, "whill_mjx.train", [*REAL, "--learner", learner], 10, tmp_path)
+    words = [*REAL, "--learner", learner]
+    straight, broken = straight_and_broken(Process, "whill_mjx.train", words, "evaluation.json", 10, tmp_path)
     assert_same_arrays(straight / "policy" / "weights.npz", broken / "policy" / "weights.npz")
     evaluations = [json.loads((out / "evaluation.json").read_text()) for out in (straight, broken)]
     assert evaluations[0]["policy"] == evaluations[1]["policy"]

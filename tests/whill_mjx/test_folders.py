@@ -82,7 +82,7 @@ from pathlib import Path
 from whill_mjx.io.folders import claim_folder
 with claim_folder(Path(sys.argv[1]), "whill_mjx.test"):
     print("held", flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 

@@ -40,8 +40,9 @@ def test_a_slow_stage_keeps_writing_its_name_and_its_time(monkeypatch):
     """The stage lasts until the heartbeat has written three times, whatever the machine's speed."""
     lines = Lines("compiling", 4)
     monkeypatch.setattr(sys, "stderr", lines)
-    with Heartbeat(every_s=0.05) as heartbeat:
-        heartbeat.stage("compiling, usually 60 s")
+    heartbeat = Heartbeat(every_s=0.05)
+    heartbeat.stage("compiling, usually 60 s")  # before its thread, which would write first after a pause in between
+    with heartbeat:
         assert lines.enough.wait(60), "no sign of life during the slow stage"
     first, *others = lines.written.splitlines()
     assert first == "compiling, usually 60 s"

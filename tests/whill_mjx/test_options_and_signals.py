@@ -154,7 +154,10 @@ def test_a_signal_ends_the_work_with_one_line_and_what_it_cleans_up_is_done(numb
             print("begun", flush=True); time.sleep(60)
         finally:
             open({str(tmp_path / "kept")!r}, "w").close()
-        """)
+        """, first="""
+        from whill_mjx.io import command_line
+        command_line.GRACE_S = 60.0  # a paused process would otherwise be ended before it has cleaned up
+        """)  # fmt: skip
     assert ended(child, number) == (130, f"stopped; go on so. ({signal.Signals(number).name})")
     assert (tmp_path / "kept").exists()
 

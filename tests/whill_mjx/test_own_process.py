@@ -20,6 +20,11 @@ def seen(word):
     return word, os.getpid(), jax.default_backend(), os.environ["JAX_PLATFORMS"]
 
 
+def work_for_ever(path):
+    path.touch()
+    time.sleep(600)
+
+
 def refuse(path):
     raise ValueError(f"{path}: not a log")
 
@@ -47,16 +52,18 @@ def test_a_process_that_is_ended_from_outside_is_said():
 
 
 @pytest.mark.quick
-def test_ctrl_c_ends_the_other_process_too():
+def test_ctrl_c_ends_the_other_process_too(tmp_path):
     def interrupt():
-        while not multiprocessing.active_children():
+        while not (tmp_path / "begun").exists():
             time.sleep(0.05)
-        time.sleep(0.5)
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
     with pytest.raises(KeyboardInterrupt):
-        on_processor_apart(time.sleep, 600.0)
+        on_processor_apart(work_for_ever, tmp_path / "begun")
+    end = time.monotonic() + 120  # it would sleep on for ten minutes
+    while multiprocessing.active_children() and time.monotonic() < end:
+        time.sleep(0.05)
     assert multiprocessing.active_children() == []
 
 

@@ -19,6 +19,7 @@ from whill_mjx.world.people.around import near_in
 from whill_mjx.world.people.contact import poses_among_people, scene_with_people, walk_around
 from whill_mjx.world.people.crowd import TRUNK, Crowd, join, people_on, scripted
 from whill_mjx.world.people.places import in_sight
+from whill_mjx.world.plane import Vector
 from whill_mjx.world.scene import Footprint, Marker, Scene, box, default_looks, no_boxes, stack_boxes
 from whill_mjx.world.solids import Solids, rod, stack_rounds
 
@@ -136,8 +137,8 @@ def test_people_stay_out_of_walls_and_boxes():
     assert int(people.there.sum()) >= 6
     steps = walked(people, WALLED)
     near = near_in(WALLED)
-    found = jax.jit(jax.vmap(near))(steps.position)
-    apart = jnp.linalg.norm(steps.position[:, :, None] - found.point, axis=-1)
+    found = jax.jit(jax.vmap(lambda place: near(place)(Vector.of(place))))(steps.position)
+    apart = (Vector.of(steps.position[:, None]) - found.point).length
     assert float(jnp.where(found.mask, apart, 9.0).min()) > law.RADIUS - 0.01
     gone = jnp.linalg.norm(jnp.diff(steps.position, axis=0), axis=-1)
     assert float(gone.sum(0)[people.there].min()) > 5.0  # nobody is stuck
@@ -153,9 +154,10 @@ def test_people_come_into_a_scene_with_textures_and_lamps():
 
 def test_what_hangs_above_heads_is_walked_under():
     rods = stack_rounds([rod((3.0, -1.0, z), (3.0, 1.0, z), 0.1, (0.5,) * 3) for z in (1.0, 2.4)])
-    near = near_in(dataclasses.replace(EMPTY, solids=Solids(None, rods)))(jnp.array([[2.0, 0.0]]))
-    assert list(np.asarray(near.mask)[0, -2:]) == [True, False]
-    np.testing.assert_allclose(near.point[0, -2], [2.9, 0.0], atol=1e-5)
+    near = near_in(dataclasses.replace(EMPTY, solids=Solids(None, rods)))
+    found = near(jnp.array([[2.0, 0.0]]))(Vector(jnp.array([2.0]), jnp.array([0.0])))
+    assert list(np.asarray(found.mask)[-2:, 0]) == [True, False]
+    np.testing.assert_allclose(found.point.stacked()[-2, 0], [2.9, 0.0], atol=1e-5)
 
 
 @pytest.mark.long

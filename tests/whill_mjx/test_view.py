@@ -278,7 +278,7 @@ def test_pages_fit_a_telephone_in_a_real_browser(tmp_path):
     seen = subprocess.run(
         [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--dump-dom",
          f"--user-data-dir={tmp_path / 'profile'}", (tmp_path / "measure.html").as_uri()],
-        capture_output=True, text=True, timeout=120).stdout  # fmt: skip
+        capture_output=True, text=True, timeout=600).stdout  # fmt: skip
     measured = json.loads(re.search(r"<title>(\[\[.*?\]\])</title>", seen).group(1))
     assert len(measured) == 2
     for scroll, width, charts in measured:
@@ -302,7 +302,7 @@ def test_a_real_browser_loads_a_live_page_again_when_its_run_changes(tmp_path):
          f"--user-data-dir={tmp_path / 'profile'}", f"http://127.0.0.1:{server.server_address[1]}/"],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
     try:
-        loads.get(timeout=60)
+        loads.get(timeout=120)
         for step in range(600):  # until the browser has seen a change; its first question may come after one
             with (folder / "metrics.jsonl").open("a") as file:
                 file.write(json.dumps({"env_steps": 900 + step}) + "\n")

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Card
+from whill_mjx.io.fields import check, parameter_field
 from whill_mjx.io.registry import Registry
 from whill_mjx.vehicle.types import Parameter, parameters_of
 
@@ -81,17 +82,37 @@ EFFECTS = all_effects()
 def make_effect(name: str, **values: float) -> Effect:
     """The effect of this name with arrays as leaves; parameters that are not given are neutral.
 
+    Args:
+        name: of a known effect.
+        values: by parameter, in its unit. Numbers must lie where a vehicle file may have them; arrays of JAX are taken
+            as they are.
+
     Raises:
-        ValueError: no such effect, or no such parameter; names the known ones.
+        ValueError: no such effect, or no such parameter; names the known ones. Or a number out of its range.
+    """
+    known = known_parameters(name, values)
+    for field, value in values.items():
+        if not isinstance(value, jax.Array):
+            about = known[field]
+            allowed = parameter_field(f"{name}.{field}", about.unit, about.low, about.high, about.neutral)
+            check(f"effect {name!r}", allowed, value, field)
+    effect = EFFECTS[name](**values)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), effect)
+
+
+def known_parameters(name: str, used: Iterable[str] = ()) -> dict[str, Parameter]:
+    """The parameters of the effect of this name.
+
+    Raises:
+        ValueError: no such effect, or one of the used parameters is none of it; names the known ones.
     """
     if name not in EFFECTS:
         raise ValueError(f"unknown effect {name!r} (known: {', '.join(sorted(EFFECTS))}). Correct the name.")
     known = parameters_of(EFFECTS[name])
-    for field in values:
+    for field in used:
         if field not in known:
             raise ValueError(f"effect {name!r} has no parameter {field!r} (known: {', '.join(known)}). Correct it.")
-    effect = EFFECTS[name](**values)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), effect)
+    return known
 
 
 def make_effects(names: Iterable[str]) -> tuple[Effect, ...]:

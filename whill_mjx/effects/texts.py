@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from whill_mjx.effects import EFFECTS, make_effect
-from whill_mjx.vehicle.types import VehicleParams, parameters_of
+from whill_mjx.effects.registry import known_parameters
+from whill_mjx.vehicle.types import VehicleParams
 
 
 def with_effects(params: VehicleParams, texts: Sequence[str]) -> VehicleParams:
@@ -44,9 +45,9 @@ def parse_effect(text: str) -> tuple[str, dict[str, float]]:
                 f"effect {text!r}: {pair!r} is not PARAMETER=NUMBER{'' if equals else ' (no =)'}. "
                 "Write it like command_delay:delay=0.2."
             ) from None
-    make_effect(name, **dict.fromkeys(values, 0.0))  # unknown names
+    known = known_parameters(name, values)
     for key, value in values.items():
-        about = parameters_of(EFFECTS[name])[key]
+        about = known[key]
         if not (about.low <= value <= about.high or value == about.neutral):
             raise ValueError(
                 f"effect {text!r}: {key} is {value:g} {about.unit}; it must lie within {about.low:g} to "

@@ -8,11 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from whill_mjx.env.episode import reset
 from whill_mjx.env.moments import view_of
 from whill_mjx.env.records import Env
-from whill_mjx.io.fields import shown
+from whill_mjx.io.fields import check, parameter_field, shown
 from whill_mjx.sensors.base import Sensor, as_sensors, check_sensor
 from whill_mjx.sensors.registry import known_sensors
 from whill_mjx.tasks.check import check_is_task, check_task, fitted_task
@@ -20,7 +21,7 @@ from whill_mjx.tasks.tasks import Task, make_task
 from whill_mjx.vehicle.model import build_model
 from whill_mjx.vehicle.presets import preset_params
 from whill_mjx.vehicle.specs import VehicleSpec
-from whill_mjx.vehicle.types import VehicleParams
+from whill_mjx.vehicle.types import VehicleParams, parameters_of
 from whill_mjx.vehicle.vehicle_file import load_vehicle
 from whill_mjx.world.maps.places import farthest_move
 from whill_mjx.world.scene import MapWalls
@@ -61,8 +62,9 @@ def make_env(
             dict. None takes those of the task, and the camera image alone, as an array, where it names none.
 
     Raises:
-        ValueError: unknown task, layout, vehicle, looks or sensor; a method of the task that fails or returns something
-            else than it must; a share that is none; rich looks of a task without a lane.
+        ValueError: unknown task, layout, vehicle, looks or sensor; a parameter of the vehicle out of its range; a
+            method of the task that fails or returns something else than it must; a share that is none; rich looks of a
+            task without a lane.
     """
     task = make_task(task) if isinstance(task, str) else task
     check_is_task(task)
@@ -126,6 +128,17 @@ def _looks_of(task: Task, looks: str | None) -> str:
     return looks
 
 
+def _check_values(spec: VehicleSpec, params: VehicleParams) -> None:
+    """Raise ValueError for a parameter beyond what the vehicle's file may have; values of a trace are not known yet."""
+    sizes = spec.mass, spec.wheel_radius
+    for holder, owner in (("body", params.body), *((effect.name, effect) for effect in params.effects)):
+        for name, about in parameters_of(owner).items():
+            value, dotted = getattr(owner, name), f"{holder}.{name}"
+            allowed = parameter_field(dotted, about.unit, about.low, about.high, about.neutral, sizes)
+            for number in () if isinstance(value, jax.core.Tracer) else np.unique(np.asarray(value)):
+                check(f"vehicle {spec.name!r}", allowed, number)
+
+
 def as_vehicle(
     vehicle: str | Path | VehicleSpec | tuple[VehicleSpec, VehicleParams] | None,
 ) -> tuple[VehicleSpec, VehicleParams]:
@@ -136,6 +149,7 @@ def as_vehicle(
         if [type(one) for one in vehicle] != [VehicleSpec, VehicleParams]:
             there = ", ".join(type(one).__name__ for one in vehicle)
             raise ValueError(f"vehicle is ({there}); a pair is a VehicleSpec and its VehicleParams. Give both.")
+        _check_values(*vehicle)
         return vehicle
     if not isinstance(vehicle, str | Path | None):
         raise ValueError(f"vehicle is {shown(vehicle)}; it must be a vehicle file, the name of a built-in vehicle, a "

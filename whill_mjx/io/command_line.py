@@ -12,6 +12,7 @@ import io
 import logging
 import math
 import os
+import re
 import select
 import signal
 import sys
@@ -49,6 +50,9 @@ REMEDIES = {
     errno.ENAMETOOLONG: "Choose a shorter name.",
     errno.ENOENT: "Correct the path.",
 }
+
+NO_NUMBER = re.compile(r"Error parsing (\S+): .*?(?:with base 10|string to float): '([^']*)'")
+"""tyro's words for an option that takes a number, and the word that is none."""
 
 WRITING = threading.RLock()
 """Held while a file or a folder gets its final name; the process does not end meanwhile."""
@@ -276,6 +280,9 @@ def _parsed(options: type, description: str | None, positional: bool, args: list
                 raise
     lines = [line.strip(FRAME) for line in complaint.getvalue().splitlines()]
     text = " ".join(line for line in lines[1:] if line).split("For full helptext")[0].strip()
+    if number := NO_NUMBER.match(text):
+        kind = "whole number, in digits alone" if "int()" in text else "number"
+        raise OptionError(f"{number[1]} {number[2]}: must be a {kind}. Correct it.")
     if text.startswith("Error parsing"):
         text = text.split("Argument helptext:")[0].strip()
     raise OptionError(f"{text.rstrip('.')}. See --help.")

@@ -406,7 +406,7 @@ def check_learner(preset: Preset, learner: str, batch: BatchEnv) -> None:
     """Raise ValueError where a preset's learner, "dreamer" or "ppo", does not suit what it would train on."""
     env = functional_env(batch, preset.safety, targets=learner == "dreamer" and TRUTH in preset.learner.decode_only)
     if learner == "dreamer":
-        check_fit(env, preset.learner)
+        check_fit(env, preset.learner, preset.total_steps)
     else:
         ppo.check_fit(env, preset.ppo)
     _, carry = (dreamer_policy if learner == "dreamer" else ppo_policy)(preset, batch.env)

@@ -11,6 +11,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.dtypes import canonicalize_dtype as canonical
+from jax.extend.core import Literal
 
 from whill_mjx.io.fields import shown
 from whill_mjx.io.own_class import ALIKE, check_fixed, check_own_class
@@ -57,6 +60,7 @@ def check_task(task: Task) -> None:
     moment = _moment(world)
     real = lambda dtype: not jnp.issubdtype(dtype, jnp.complexfloating)  # noqa: E731
     terms = _check_scalars(task, "rewards", moment, "numbers", real)
+    _check_constants(task, moment, terms)
     ends = _check_scalars(task, "endings", moment, "flags (True or False)", lambda dtype: jnp.issubdtype(dtype, bool))
     _check_terms(task, terms, ends)
     _check_observations(task)
@@ -166,6 +170,34 @@ def _check_scalars(task: Task, method: str, moment: Any, what: str, fits: Any) -
         if getattr(value, "shape", None) != () or not fits(value.dtype):
             raise _wrong(task, method, f"{name!r} is {_named(value)}", f"one of the {what}, of shape ()")
     return terms
+
+
+def _check_constants(task: Task, moment: Any, terms: Mapping[str, Any]) -> None:
+    """Refuse a reward term that is the same in every moment and no finite number: no step could ever earn it."""
+    program = jax.make_jaxpr(task.rewards)(moment).jaxpr
+    varying = set(program.invars)
+    for line in program.eqns:
+        if any(one in varying for one in line.invars if not isinstance(one, Literal)):
+            varying |= set(line.outvars)
+    names = jax.tree.leaves({name: name for name in terms})
+    same = [name for name, out in zip(names, program.outvars, strict=True) if isinstance(out, Literal)
+            or out not in varying]
+    if not same:
+        return
+    values = jax.jit(lambda: [task.rewards(_zeros(moment))[name] for name in same])()
+    for name, value in zip(same, jax.device_get(values), strict=True):
+        if not np.isfinite(value):
+            raise _wrong(task, "rewards", f"{name!r} is always {value}", "a finite number")
+
+
+def _zeros(tree: Any) -> Any:
+    """Arrays of these shapes, for a program that reads none of their values."""
+    key = jax.dtypes.prng_key
+
+    def zero(one: Any) -> jax.Array:
+        return jax.random.key(0) if jnp.issubdtype(one.dtype, key) else jnp.zeros(one.shape, canonical(one.dtype))
+
+    return jax.tree.map(zero, tree)
 
 
 def _traced(task: Task, method: str, argument: Any) -> Any:

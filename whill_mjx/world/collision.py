@@ -84,38 +84,41 @@ def distances(vehicle: Footprint, stadiums: Stadiums) -> jax.Array:
 
     Two disjoint convex shapes without round parts are closest at a corner of one of them.
     """
-    start, end, crosses = _in_frame(vehicle, stadiums)
+    (x0, y0), (x1, y1), crosses = _in_frame(vehicle, stadiums)
     a, b = vehicle.half_length, vehicle.half_width
-
-    def to_rectangle(points):
-        out = jnp.maximum(jnp.abs(points) - jnp.stack([a, b]), 0.0)
-        return jnp.sqrt(jnp.sum(out**2, -1))
-
-    signs = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    corner = signs * jnp.stack([a, b])  # (4, 2)
-    way = end - start
-    square = jnp.maximum(jnp.sum(way**2, -1), 1e-12)
-    share = jnp.clip(((corner[:, None] - start) * way).sum(-1) / square, 0.0, 1.0)  # (4, M)
-    off = corner[:, None] - (start + share[..., None] * way)
-    to_segment = jnp.sqrt(jnp.sum(off**2, -1)).min(0)
-    apart = jnp.minimum(jnp.minimum(to_rectangle(start), to_rectangle(end)), to_segment)
-    return jnp.where(crosses, 0.0, apart) - stadiums.radius
+    way_x, way_y = x1 - x0, y1 - y0
+    square = jnp.maximum(way_x**2 + way_y**2, 1e-12)
+    least = jnp.minimum(*(_square(*(jnp.maximum(jnp.abs(one) - half, 0.0) for one, half in ((x, a), (y, b))))
+                          for x, y in ((x0, y0), (x1, y1))))  # fmt: skip
+    for x, y in ((a, b), (a, -b), (-a, b), (-a, -b)):  # the corners
+        x, y = x - x0, y - y0
+        share = jnp.clip((x * way_x + y * way_y) / square, 0.0, 1.0)
+        least = jnp.minimum(least, _square(x - share * way_x, y - share * way_y))
+    return jnp.where(crosses, 0.0, jnp.sqrt(least)) - stadiums.radius
 
 
-def _in_frame(vehicle: Footprint, stadiums: Stadiums) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Both ends (M, 2) [m] of each axis in the vehicle's frame, and whether the axis meets the rectangle (M,)."""
+def _square(x: jax.Array, y: jax.Array) -> jax.Array:
+    return x * x + y * y
+
+
+Point = tuple[jax.Array, jax.Array]
+"""x and y (M,) [m], apart: XLA computes arrays whose last axis has two entries one number at a time on a processor."""
+
+
+def _in_frame(vehicle: Footprint, stadiums: Stadiums) -> tuple[Point, Point, jax.Array]:
+    """Both ends of each axis in the vehicle's frame, and whether the axis meets the rectangle (M,)."""
     c, s = jnp.cos(vehicle.yaw), jnp.sin(vehicle.yaw)
 
     def own(points):
         dx, dy = points[:, 0] - vehicle.x, points[:, 1] - vehicle.y
-        return jnp.stack([dx * c + dy * s, dy * c - dx * s], -1)
+        return dx * c + dy * s, dy * c - dx * s
 
     start, end = own(stadiums.start), own(stadiums.end)
-    middle, reach = (start + end) / 2, (end - start) / 2
+    x, y = ((one + other) / 2 for one, other in zip(start, end, strict=True))  # of the middle
+    half_x, half_y = ((other - one) / 2 for one, other in zip(start, end, strict=True))
     a, b = vehicle.half_length, vehicle.half_width
-    crosses = (jnp.abs(middle[:, 0]) <= a + jnp.abs(reach[:, 0])) & (jnp.abs(middle[:, 1]) <= b + jnp.abs(reach[:, 1]))
-    turned = jnp.abs(middle[:, 0] * reach[:, 1] - middle[:, 1] * reach[:, 0])
-    return start, end, crosses & (turned <= a * jnp.abs(reach[:, 1]) + b * jnp.abs(reach[:, 0]))
+    crosses = (jnp.abs(x) <= a + jnp.abs(half_x)) & (jnp.abs(y) <= b + jnp.abs(half_y))
+    return start, end, crosses & (jnp.abs(x * half_y - y * half_x) <= a * jnp.abs(half_y) + b * jnp.abs(half_x))
 
 
 def touches(vehicle: Footprint, obstacles: Obstacles) -> jax.Array:

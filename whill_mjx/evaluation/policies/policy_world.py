@@ -39,10 +39,19 @@ class PolicyWorld:
 
 
 def find_policy(path: str | Path) -> Path:
-    """Folder of the policy that is given by itself or by the folder of its training."""
+    """Folder of the policy that is given by itself or by the folder of its training.
+
+    Raises:
+        OptionError: the training has not exported its policy yet.
+    """
     path = Path(path)
     inside = path / POLICY
-    return inside if (inside / "policy.json").is_file() and not (path / "policy.json").is_file() else path
+    if (path / "policy.json").is_file():
+        return path
+    if (path / RUN_FILE).is_file() and not inside.exists():
+        raise OptionError(f"{path}: there is no policy in this run yet. A training exports it at its end: wait for it, "
+                          "or give its command again to go on.")
+    return inside if (inside / "policy.json").is_file() else path
 
 
 def read_world(path: str | Path, task: str | None = None) -> PolicyWorld:

@@ -2,64 +2,82 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
 from whill_mjx.world.collision import from_above
-from whill_mjx.world.people.law import Mover, Near
-from whill_mjx.world.scene import Boxes, Footprint, Scene
+from whill_mjx.world.people.law import Mover, Near, Surroundings
+from whill_mjx.world.plane import Vector
+from whill_mjx.world.scene import Boxes, Footprint, MapWalls, Scene
 from whill_mjx.world.solids import Rounds
 
 TALL = 1.9
 """What begins above this height is walked under [m]."""
 
 
-def near_in(scene: Scene):
-    """Function of places (N, 2) that gives the nearest points of everything that stands in a scene without people."""
+def near_in(scene: Scene) -> Surroundings:
+    """Nearest points of everything that stands in a scene without people.
+
+    The lists of a map's walls are read where people are at first, and hold what they come near to in one step.
+    """
     boxes, walls = scene.boxes, scene.walls
     if walls is not None:
         boxes = jax.tree.map(lambda leaf: leaf[: leaf.shape[0] - walls.keep], boxes)  # the rest are pictures of walls
     rounds = None if scene.solids is None else scene.solids.rounds
 
-    def near(place: jax.Array) -> Near:
-        found = [Near(jnp.zeros((place.shape[0], 1, 2)), jnp.zeros((place.shape[0], 1), bool))]
-        if boxes.mask.shape[0]:
-            found.append(_on_boxes(place, boxes))
-        if walls is not None:
-            index = jnp.asarray(walls.near)[walls.cell(place[:, 0], place[:, 1])]  # (N, M)
-            segment = jnp.asarray(walls.segments)[jnp.maximum(index, 0)]
-            found.append(Near(_on_segments(place, segment[:, :, 0], segment[:, :, 1]), index >= 0))
-        if rounds is not None:
-            found.append(_on_rounds(place, rounds))
-        return Near(*(jnp.concatenate(parts, 1) for parts in zip(*found, strict=True)))
+    def around(first: jax.Array) -> Callable[[Vector], Near]:
+        listed = None if walls is None else _listed(walls, first)
 
-    return near
+        def near(place: Vector) -> Near:
+            none = jnp.zeros((1, *place.x.shape))
+            found = [Near(Vector(none, none), none > 0.0)]
+            if boxes.mask.shape[0]:
+                found.append(_on_boxes(place, boxes))
+            if listed is not None:
+                start, way, there = listed
+                found.append(Near(_on_segments(place, start, way), there))
+            if rounds is not None:
+                found.append(_on_rounds(place, rounds))
+            return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
+
+        return near
+
+    return around
 
 
-def _on_boxes(place: jax.Array, boxes: Boxes) -> Near:
-    c, s = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
-    dx, dy = place[:, None, 0] - boxes.centre[:, 0], place[:, None, 1] - boxes.centre[:, 1]  # (N, P)
-    along = jnp.clip(dx * c + dy * s, -boxes.half[:, 0], boxes.half[:, 0])
-    across = jnp.clip(dy * c - dx * s, -boxes.half[:, 1], boxes.half[:, 1])
-    point = jnp.stack([along * c - across * s, along * s + across * c], -1) + boxes.centre[:, :2]
+def _listed(walls: MapWalls, place: jax.Array) -> tuple[Vector, Vector, jax.Array]:
+    """Start and way (M, N) [m] of the walls near each place (N, 2), and which of them (M, N) there are."""
+    index = jnp.asarray(walls.near)[walls.cell(place[:, 0], place[:, 1])].T
+    numbers = jnp.asarray(walls.segments).reshape(-1, 4).T
+    x0, y0, x1, y1 = (part[jnp.maximum(index, 0)] for part in numbers)
+    # The barrier keeps XLA from reading the lists again for each place.
+    return jax.lax.optimization_barrier((Vector(x0, y0), Vector(x1 - x0, y1 - y0), index >= 0))
+
+
+def _on_boxes(place: Vector, boxes: Boxes) -> Near:
+    axis = Vector.at_angle(boxes.yaw[:, None])
+    centre, half = (Vector(array[:, 0, None], array[:, 1, None]) for array in (boxes.centre, boxes.half))
+    off = place - centre  # (P, N)
+    along, across = jnp.clip(axis.dot(off), -half.x, half.x), jnp.clip(axis.cross(off), -half.y, half.y)
+    point = centre + axis * along + axis.left * across
     there = boxes.mask & (boxes.centre[:, 2] - boxes.half[:, 2] < TALL)
-    return Near(point, jnp.broadcast_to(there, point.shape[:2]))
+    return Near(point, jnp.broadcast_to(there[:, None], point.x.shape))
 
 
-def _on_segments(place: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
-    way = end - start
-    square = jnp.maximum(jnp.sum(way**2, -1), 1e-12)
-    share = jnp.clip(jnp.sum((place[:, None] - start) * way, -1) / square, 0.0, 1.0)
-    return start + share[..., None] * way
+def _on_segments(place: Vector, start: Vector, way: Vector) -> Vector:
+    share = jnp.clip((place - start).dot(way) / jnp.maximum(way.dot(way), 1e-12), 0.0, 1.0)
+    return start + way * share
 
 
-def _on_rounds(place: jax.Array, rounds: Rounds) -> Near:
+def _on_rounds(place: Vector, rounds: Rounds) -> Near:
     seen = from_above(rounds)
-    axis = _on_segments(place, seen.start[None], seen.end[None])
-    away = place[:, None] - axis
-    far = jnp.sqrt(jnp.sum(away**2, -1) + 1e-12)
-    point = axis + away * (jnp.minimum(seen.radius, far) / far)[..., None]
-    return Near(point, jnp.broadcast_to(seen.mask & (seen.low < TALL), point.shape[:2]))
+    start, end = (Vector(array[:, 0, None], array[:, 1, None]) for array in (seen.start, seen.end))
+    axis = _on_segments(place, start, end - start)
+    away = place - axis
+    point = axis + away * (jnp.minimum(seen.radius[:, None], away.length) / away.length)
+    return Near(point, jnp.broadcast_to((seen.mask & (seen.low < TALL))[:, None], point.x.shape))
 
 
 def mover_of(before: Footprint, after: Footprint, duration: float) -> Mover:

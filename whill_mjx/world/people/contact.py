@@ -24,6 +24,8 @@ from whill_mjx.world.scene import Footprint, Scene
 
 Ends = tuple[jax.Array, jax.Array]
 """Both ends (N, PARTS, 3) [m] of the axes of people's capsules."""
+Axes = tuple[jax.Array, ...]
+"""x, y, z of one end and x, y, z of the other (N, TOUCHING) [m], of those that a vehicle can meet."""
 STANDING = 0.05
 """Speed towards a person below which the vehicle stands, as far as contact is concerned [m/s]."""
 FASTEST_FOOT = 4.8
@@ -69,22 +71,21 @@ class Capsules(NamedTuple):
 
     height: jax.Array  # (N,) m, of the people
     there: jax.Array  # (N,) bool
-    first: Ends
-    last: Ends
+    first: Axes
+    last: Axes
 
 
-def _touching(ends: Ends) -> Ends:
-    """Ends (N, TOUCHING, 3) of the capsules that a vehicle can meet."""
-    return ends[0][:, : body.TOUCHING], ends[1][:, : body.TOUCHING]
+def _touching(ends: Ends) -> Axes:
+    return tuple(end[:, : body.TOUCHING, axis] for end in ends for axis in range(3))
 
 
 def _distances(capsules: Capsules, vehicle: Footprint, share: jax.Array) -> jax.Array:
     """(N,) m from a vehicle to each person at a share () of the period."""
-    start, end = (a + share * (b - a) for a, b in zip(capsules.first, capsules.last, strict=True))
+    x0, y0, z0, x1, y1, z1 = (a + share * (b - a) for a, b in zip(capsules.first, capsules.last, strict=True))
     radius = capsules.height[:, None] * jnp.array(body.RADII)[: body.TOUCHING]
-    low = jnp.minimum(start[..., 2], end[..., 2]) - radius
+    low = jnp.minimum(z0, z1) - radius
     there = jnp.broadcast_to(capsules.there[:, None], low.shape)
-    parts = (start[..., :2], end[..., :2], radius, low, there)
+    parts = (jnp.stack([x0, y0], -1), jnp.stack([x1, y1], -1), radius, low, there)
     stadiums = Stadiums(*(part.reshape(-1, *part.shape[2:]) for part in parts))
     far = distances(vehicle, stadiums)
     met = stadiums.mask & (stadiums.low < vehicle.height)

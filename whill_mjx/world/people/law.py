@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from whill_mjx.world.people.crowd import RADIUS, TRUNK, People
+from whill_mjx.world.plane import Vector, choose, largest
 
 STRENGTH, REACH = 3.0, 0.1
 """Strength [-] and range [m] of the repulsion between people (k and D of Eq. 3)."""
@@ -38,10 +41,14 @@ ARRIVED = 0.5
 
 
 class Near(NamedTuple):
-    """Nearest point of each of M standing things to each person."""
+    """Nearest point of each of M standing things to each of N people."""
 
-    point: jax.Array  # (N, M, 2) m
-    mask: jax.Array  # (N, M) bool: False does not count
+    point: Vector  # (M, N) m
+    mask: jax.Array  # (M, N) bool: False does not count
+
+
+Surroundings = Callable[[jax.Array], Callable[[Vector], Near]]
+"""What stands around: of places (N, 2), a function of places (N,) up to a step away from them."""
 
 
 class Mover(NamedTuple):
@@ -54,70 +61,69 @@ class Mover(NamedTuple):
     yaw_rate: jax.Array  # () rad/s
 
 
-def walk(people: People, near, mover: Mover | None, duration: float) -> People:
+def walk(people: People, near: Surroundings, mover: Mover | None, duration: float) -> People:
     """People after a time, with the vehicle moving on evenly.
 
     Args:
         people: before.
-        near: (N, 2) places -> `Near`; what stands around.
+        near: what stands around.
         mover: the vehicle at the beginning; None is none.
         duration: static [s].
     """
     steps = max(1, math.ceil(duration / STEP - 1e-9))
     dt = duration / steps
     for _ in range(steps):
-        people = _one_step(people, near, mover, dt)
+        people = _one_step(people, near(people.position), mover, dt)
         if mover is not None:
             mover = _later(mover, dt)
     return people
 
 
-def _one_step(people: People, near, mover: Mover | None, dt: float) -> People:
+def _one_step(people: People, near: Callable[[Vector], Near], mover: Mover | None, dt: float) -> People:
     people = _next_targets(people)
     row = jnp.arange(people.speed.shape[0])
-    goal = people.route[row, people.target]
-    to_goal = goal - people.position
-    far = _length(to_goal)
-    desired = to_goal / jnp.maximum(far, 1e-6)[:, None]
-    looks = jnp.stack([jnp.cos(people.heading), jnp.sin(people.heading)], -1)
+    here = Vector.of(people.position)
+    to_goal = Vector.of(people.route[row, people.target]) - here
+    far = to_goal.length
+    desired = to_goal * (1.0 / jnp.maximum(far, 1e-6))
+    looks = Vector.at_angle(people.heading)
 
     turned = desired + _aside_from_people(people, desired, looks)
     if mover is not None:
         turned += _aside_from_mover(people, desired, looks, mover)
-    turned = _unit(turned, looks)
-    back = _dot(desired, turned) * _dot(desired, looks) < 0.0
-    eased = _unit(looks + (turned - looks) * (dt / REACTION), turned)  # Eq. 7
-    way = jnp.where(back[:, None], turned, eased)
+    turned = turned.unit(looks)
+    back = desired.dot(turned) * desired.dot(looks) < 0.0
+    eased = (looks + (turned - looks) * (dt / REACTION)).unit(turned)  # Eq. 7
+    way = choose(back, turned, eased)
 
     if mover is not None:  # to those who yield, it is a wall beside which they walk
-        side = Near(nearest_on(mover, people.position)[:, None], people.yields[:, None])
-        way = _along_walls(people.position, way, side, _berth(people))
+        side = Near(_nearest_on(mover, here).at(None), people.yields[None])
+        way = _along_walls(here, way, side, _berth(people))
     room = _room_among_people(people, way)
     if mover is not None:
         room = jnp.minimum(room, _room_to_mover(people, way, mover))
     speed = jnp.clip(room / people.gap, 0.0, people.speed)
-    standing = near(people.position)
-    way = _along_walls(people.position, way, standing, RADIUS)
+    standing = near(here)
+    way = _along_walls(here, way, standing, RADIUS)
 
-    scripted = people.scripted[:, None]
-    way = jnp.where(scripted, desired, way)
+    way = choose(people.scripted, desired, way)
     speed = jnp.where(people.scripted, people.speed, speed)
     last = jnp.where(people.onward, people.route.shape[1] - 1, 0)
     ends = ~people.returns & (people.target == last)
     speed = jnp.where(ends, jnp.minimum(speed, far / dt), speed) * people.there
-    place = people.position + dt * speed[:, None] * way
+    place = here + way * (dt * speed)
     if mover is not None:
-        place = place + _short_of_walls(place, _off_mover(people, place, mover, dt), people.position, standing)
-    place = jnp.where(scripted, place, _out_of_walls(place, near))
-    return moved_to(people, place, dt, way)
+        place = place + _short_of_walls(place, _off_mover(people, place, mover, dt), here, standing)
+    place = choose(people.scripted, place, _out_of_walls(place, near))
+    return moved_to(people, place.stacked(), dt, way)
 
 
-def moved_to(people: People, place: jax.Array, dt: float, way: jax.Array | None = None) -> People:
-    """People at new places (N, 2) after `dt` [s], looking along `way` (N, 2), with the gait that belongs to it."""
+def moved_to(people: People, place: jax.Array, dt: float, way: Vector | None = None) -> People:
+    """People at new places (N, 2) after `dt` [s], looking along `way` (N,), with the gait that belongs to it."""
     step = place - people.position
-    gone = _length(step)
+    gone = Vector.of(step).length
     speed = gone / dt
-    heading = people.heading if way is None else jnp.arctan2(way[:, 1], way[:, 0])
+    heading = people.heading if way is None else way.angle
     phase = people.phase + jnp.pi * gone / jnp.maximum(step_length(speed), 0.1)
     return dataclasses.replace(
         people, position=place, velocity=step / dt, heading=heading, phase=jnp.mod(phase, 2 * jnp.pi)
@@ -135,7 +141,7 @@ def step_length(speed: jax.Array) -> jax.Array:
 def _next_targets(people: People) -> People:
     row = jnp.arange(people.speed.shape[0])
     last = people.route.shape[1] - 1
-    far = _length(people.route[row, people.target] - people.position)
+    far = Vector.of(people.route[row, people.target] - people.position).length
     there = far < ARRIVED
     at_end = people.target == jnp.where(people.onward, last, 0)
     turns = there & at_end & people.returns
@@ -145,115 +151,120 @@ def _next_targets(people: People) -> People:
     return dataclasses.replace(people, target=target, onward=onward)
 
 
-def _aside_from_people(people: People, desired: jax.Array, looks: jax.Array) -> jax.Array:
-    """(N, 2) sum of the influences of all others (Eqs. 1 to 5)."""
-    apart = people.position[None] - people.position[:, None]  # (N, N, 2): from each one to each other
-    distance = _length(apart)
-    other = ~jnp.eye(distance.shape[0], dtype=bool) & people.there
-    own, theirs = people.velocity[:, None], people.velocity[None]
-    person = Person(own, desired[:, None], looks[:, None])
-    return _influence(person, Neighbour(apart, distance, 2 * RADIUS, other, theirs, looks[None], apart)).sum(1)
+def _aside_from_people(people: People, desired: Vector, looks: Vector) -> Vector:
+    """(N,) sum of the influences of all others (Eqs. 1 to 5). In arrays (N, N) the person is last, the other first."""
+    apart, distance, other = _others(people)
+    velocity, before, own = Vector.of(people.velocity), np.s_[:, None], None
+    person = Person(velocity.at(own), desired.at(own), looks.at(own))
+    others = Neighbour(apart, distance, 2 * RADIUS, other, velocity.at(before), looks.at(before), apart)
+    influence = _influence(person, others)
+    return Vector(influence.x.sum(0), influence.y.sum(0))
 
 
-def _aside_from_mover(people: People, desired: jax.Array, looks: jax.Array, mover: Mover) -> jax.Array:
-    """(N, 2) influence of the vehicle on those who yield."""
-    nearest = nearest_on(mover, people.position)
-    arm = nearest - mover.centre
-    velocity = mover.velocity + mover.yaw_rate * jnp.stack([-arm[:, 1], arm[:, 0]], -1)
-    apart = nearest - people.position
-    drives = _unit(velocity, jnp.broadcast_to(mover.axis, velocity.shape))
+def _others(people: People) -> tuple[Vector, jax.Array, jax.Array]:
+    """(N, N) way [m] and distance [m] from each person (last) to each other, and whether that is one who is there."""
+    here = Vector.of(people.position)
+    apart = here.at(np.s_[:, None]) - here.at(None)
+    other = ~jnp.eye(people.speed.shape[0], dtype=bool) & people.there[:, None]
+    return apart, apart.length, other
+
+
+def _aside_from_mover(people: People, desired: Vector, looks: Vector, mover: Mover) -> Vector:
+    """(N,) influence of the vehicle on those who yield."""
+    here, centre = Vector.of(people.position), Vector.of(mover.centre)
+    nearest = _nearest_on(mover, here)
+    velocity = Vector.of(mover.velocity) + (nearest - centre).left * mover.yaw_rate
+    apart = nearest - here
+    drives = velocity.unit(Vector.of(mover.axis))
     # Which side to pass is decided by the middle of the vehicle, for its nearest point lies straight ahead.
-    vehicle = Neighbour(apart, _length(apart), RADIUS, people.yields, velocity, drives, mover.centre - people.position)
-    return _influence(Person(people.velocity, desired, looks), vehicle)
+    vehicle = Neighbour(apart, apart.length, RADIUS, people.yields, velocity, drives, centre - here)
+    return _influence(Person(Vector.of(people.velocity), desired, looks), vehicle)
 
 
 class Person(NamedTuple):
-    """Who is turned aside; vectors (..., 2)."""
+    """Who is turned aside; vectors (...)."""
 
-    velocity: jax.Array  # [m/s]
-    desired: jax.Array  # direction
-    looks: jax.Array  # direction
+    velocity: Vector  # [m/s]
+    desired: Vector  # direction
+    looks: Vector  # direction
 
 
 class Neighbour(NamedTuple):
     """Who turns a person aside: another one, or the vehicle."""
 
-    apart: jax.Array  # (..., 2) m, from the person to it
+    apart: Vector  # (...) m, from the person to it
     distance: jax.Array  # (...) m
     contact: float  # distance at which both touch [m]
     counts: jax.Array  # (...) bool, whether it is one for this person
-    velocity: jax.Array  # (..., 2) m/s
-    looks: jax.Array  # (..., 2) direction
-    beside: jax.Array  # (..., 2) m, from the person to the point that is passed on one side
+    velocity: Vector  # (...) m/s
+    looks: Vector  # (...) direction
+    beside: Vector  # (...) m, from the person to the point that is passed on one side
 
 
-def _influence(person: Person, neighbour: Neighbour) -> jax.Array:
-    """(..., 2) the direction square to the desired one in which a neighbour turns a person, times its strength."""
+def _influence(person: Person, neighbour: Neighbour) -> Vector:
+    """(...) the direction square to the desired one in which a neighbour turns a person, times its strength."""
     desired = person.desired
-    towards = neighbour.apart / jnp.maximum(neighbour.distance, 1e-6)[..., None]
-    perceived = (_dot(desired, towards) >= 0.0) | (_dot(person.looks, towards) >= 0.0)  # Eq. 1
-    closing = _dot(person.velocity - neighbour.velocity, towards) * ANTICIPATION
+    towards = neighbour.apart * (1.0 / jnp.maximum(neighbour.distance, 1e-6))
+    perceived = (desired.dot(towards) >= 0.0) | (person.looks.dot(towards) >= 0.0)  # Eq. 1
+    closing = (person.velocity - neighbour.velocity).dot(towards) * ANTICIPATION
     gap = jnp.maximum(neighbour.distance - neighbour.contact - closing, 0.0)  # Eq. 2
-    strength = STRENGTH * (1.0 + ALIGNMENT * (1.0 - _dot(desired, neighbour.looks))) * jnp.exp(-gap / REACH)
+    strength = STRENGTH * (1.0 + ALIGNMENT * (1.0 - desired.dot(neighbour.looks))) * jnp.exp(-gap / REACH)
     later = neighbour.beside + neighbour.velocity * ANTICIPATION
-    left = jnp.stack([-desired[..., 1], desired[..., 0]], -1)
-    side = jnp.where(_dot(left, later) >= 0.0, -1.0, 1.0)  # Eq. 5; to the right where it does not matter
-    return jnp.where(perceived & neighbour.counts, strength * side, 0.0)[..., None] * left
+    side = jnp.where(desired.left.dot(later) >= 0.0, -1.0, 1.0)  # Eq. 5; to the right where it does not matter
+    return desired.left * jnp.where(perceived & neighbour.counts, strength * side, 0.0)
 
 
-def _room_among_people(people: People, way: jax.Array) -> jax.Array:
+def _room_among_people(people: People, way: Vector) -> jax.Array:
     """(N,) m: free length ahead of each person up to the next one (Eq. 8)."""
-    apart = people.position[None] - people.position[:, None]
-    contact = 2 * RADIUS + ASIDE
-    ahead = _dot(apart, way[:, None])
-    aside = apart[..., 1] * way[:, None, 0] - apart[..., 0] * way[:, None, 1]
-    meets = (ahead >= 0.0) & (jnp.abs(aside) <= SQUEEZE) & people.there & ~jnp.eye(ahead.shape[0], dtype=bool)
-    return jnp.min(jnp.where(meets, _length(apart) - contact, jnp.inf), -1, initial=jnp.inf)
+    apart, distance, other = _others(people)
+    ahead, aside = apart.dot(way), way.cross(apart)
+    meets = (ahead >= 0.0) & (jnp.abs(aside) <= SQUEEZE) & other
+    return jnp.min(jnp.where(meets, distance - (2 * RADIUS + ASIDE), jnp.inf), 0, initial=jnp.inf)
 
 
-def _room_to_mover(people: People, way: jax.Array, mover: Mover) -> jax.Array:
+def _room_to_mover(people: People, way: Vector, mover: Mover) -> jax.Array:
     """(N,) m: free length ahead up to the vehicle with a person's berth around it, for those who yield."""
-    along, across = _own_frame(mover, people.position)
-    ahead, aside = _own_frame(mover, mover.centre + way)
-    enter, leave, berth = jnp.zeros(ahead.shape), jnp.full(ahead.shape, jnp.inf), _berth(people)
-    for place, go, reach in ((along, ahead, mover.half[0] + berth), (across, aside, mover.half[1] + berth)):
-        go = jnp.where(jnp.abs(go) < 1e-6, 1e-6, go)
-        one, other = (-reach - place) / go, (reach - place) / go
+    here, axis, berth = Vector.of(people.position), Vector.of(mover.axis), _berth(people)
+    place, go = _own_frame(mover, here), Vector(axis.dot(way), axis.cross(way))
+    enter, leave = jnp.zeros(berth.shape), jnp.full(berth.shape, jnp.inf)
+    for at, by, half in ((place.x, go.x, mover.half[0]), (place.y, go.y, mover.half[1])):
+        by = jnp.where(jnp.abs(by) < 1e-6, 1e-6, by)
+        one, other = (-(half + berth) - at) / by, (half + berth - at) / by
         enter, leave = jnp.maximum(enter, jnp.minimum(one, other)), jnp.minimum(leave, jnp.maximum(one, other))
-    inwards = _dot(nearest_on(mover, people.position) - people.position, way) > 0.0
+    inwards = (_nearest_on(mover, here) - here).dot(way) > 0.0
     meets = (enter <= leave) & inwards & people.yields
     return jnp.where(meets, enter, jnp.inf)
 
 
-def _off_mover(people: People, place: jax.Array, mover: Mover, dt: float) -> jax.Array:
-    """(N, 2) m: a step off the vehicle for those who yield, from a place that is nearer after `dt` than their berth."""
-    away = place - nearest_on(_later(mover, dt), place)
-    lacking = jnp.maximum(_berth(people) - _length(away), 0.0)
+def _off_mover(people: People, place: Vector, mover: Mover, dt: float) -> Vector:
+    """(N,) m: a step off the vehicle for those who yield, from a place that is nearer after `dt` than their berth."""
+    away = place - _nearest_on(_later(mover, dt), place)
+    lacking = jnp.maximum(_berth(people) - away.length, 0.0)
     off = jnp.minimum(lacking, dt * people.speed) * (people.yields & people.there)
-    return off[:, None] * _unit(away, jnp.zeros(away.shape))
+    return away.unit(away * 0.0) * off
 
 
-def stepped_back(people: People, near, mover: Mover, time: jax.Array) -> jax.Array:
+def stepped_back(people: People, near: Surroundings, mover: Mover, time: jax.Array) -> jax.Array:
     """(N, 2) m by which people step straight off the vehicle in a time (N,) [s], as far as walls behind them let."""
-    away = people.position - nearest_on(mover, people.position)
-    step = (time * people.speed)[:, None] * _unit(away, jnp.zeros(away.shape))
-    return _short_of_walls(people.position, step, people.position, near(people.position))
+    here = Vector.of(people.position)
+    away = here - _nearest_on(mover, here)
+    step = away.unit(away * 0.0) * (time * people.speed)
+    return _short_of_walls(here, step, here, near(people.position)(here)).stacked()
 
 
-def _short_of_walls(place: jax.Array, step: jax.Array, seen_from: jax.Array, near: Near) -> jax.Array:
-    """(N, 2) m: what of a step from a place leads no nearer to walls than the radius of a person, if it was farther.
+def _short_of_walls(place: Vector, step: Vector, seen_from: Vector, near: Near) -> Vector:
+    """(N,) m: what of a step from a place leads no nearer to walls than the radius of a person, if it was farther.
 
     A thin wall has no inside from which a person could be pushed back, so nobody may come to its other side. Whatever
     stands is convex: it lies behind the line through its nearest point `near`, square to the way to `seen_from`.
     """
-    away = seen_from[:, None] - near.point
-    normal = away / _length(away)[..., None]
-    free = jnp.maximum(_dot(place[:, None] - near.point, normal) - RADIUS, 0.0)
+    away = seen_from - near.point
+    normal = away * (1.0 / away.length)
+    free = jnp.maximum((place - near.point).dot(normal) - RADIUS, 0.0)
     for _ in range(2):
-        into = jnp.where(near.mask, -_dot(step[:, None], normal) - free, 0.0)  # (N, M) m
-        worst = jnp.argmax(into, -1)[:, None]
-        outward = jnp.take_along_axis(normal, worst[..., None], 1)[:, 0]
-        step = step + jnp.maximum(jnp.take_along_axis(into, worst, 1), 0.0) * outward
+        into = jnp.where(near.mask, -step.dot(normal) - free, 0.0)  # (M, N) m
+        most, outward = largest(into, normal)
+        step = step + outward * jnp.maximum(most, 0.0)
     return step
 
 
@@ -269,57 +280,43 @@ def _berth(people: People) -> jax.Array:
     return TRUNK * people.height + ASIDE
 
 
-def _along_walls(place: jax.Array, way: jax.Array, near: Near, radius: jax.Array | float) -> jax.Array:
-    """(N, 2) direction without what leads into a wall near a person of a radius [m], the most opposed wall first."""
-    away = place[:, None] - near.point
-    distance = _length(away)
-    normal = away / jnp.maximum(distance, 1e-6)[..., None]
-    close = (distance <= jnp.expand_dims(radius, -1) + BUFFER) & near.mask
+def _along_walls(place: Vector, way: Vector, near: Near, radius: jax.Array | float) -> Vector:
+    """(N,) direction without what leads into a wall near a person of a radius [m], the most opposed wall first."""
+    away = place - near.point
+    distance = away.length
+    normal = away * (1.0 / jnp.maximum(distance, 1e-6))
+    close = (distance <= radius + BUFFER) & near.mask
     for _ in range(2):
-        into = jnp.where(close, _dot(normal, way[:, None]), 0.0)  # (N, M)
-        worst = jnp.argmin(into, -1)[:, None]
-        most = jnp.take_along_axis(into, worst, 1)  # (N, 1)
-        outward = jnp.take_along_axis(normal, worst[..., None], 1)[:, 0]
-        slid = _unit(way - most * outward + PUSH * outward, way)
-        way = jnp.where(most < 0.0, slid, way)
+        most, outward = largest(jnp.where(close, -normal.dot(way), 0.0), normal)  # (N,)
+        slid = (way + outward * (most + PUSH)).unit(way)
+        way = choose(most > 0.0, slid, way)
     return way
 
 
-def _out_of_walls(place: jax.Array, near) -> jax.Array:
-    """(N, 2) places at least the radius of a person away from everything that stands."""
+def _out_of_walls(place: Vector, near: Callable[[Vector], Near]) -> Vector:
+    """(N,) places at least the radius of a person away from everything that stands."""
     for _ in range(2):
         found = near(place)
-        away = place[:, None] - found.point
-        distance = jnp.where(found.mask, _length(away), jnp.inf)
-        worst = jnp.argmin(distance, -1)[:, None]
-        least = jnp.take_along_axis(distance, worst, 1)
-        outward = jnp.take_along_axis(away, worst[..., None], 1)[:, 0] / jnp.maximum(least, 1e-6)
-        place = place + jnp.where(jnp.isfinite(least), jnp.maximum(RADIUS - least, 0.0), 0.0) * outward
+        away = place - found.point
+        nearness, outward = largest(jnp.where(found.mask, -away.length, -jnp.inf), away)
+        far = jnp.isfinite(nearness)
+        place = place + outward * (jnp.where(far, jnp.maximum(RADIUS + nearness, 0.0), 0.0)
+                                   / jnp.where(far, jnp.maximum(-nearness, 1e-6), 1.0))  # fmt: skip
     return place
 
 
-def _own_frame(mover: Mover, place: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Places (N, 2) in the vehicle's frame: ahead (N,) and to the left (N,) [m]."""
-    off = place - mover.centre
-    return _dot(off, mover.axis), off[..., 1] * mover.axis[0] - off[..., 0] * mover.axis[1]
+def _own_frame(mover: Mover, place: Vector) -> Vector:
+    """Places (N,) in the vehicle's frame: ahead and to the left [m]."""
+    off, axis = place - Vector.of(mover.centre), Vector.of(mover.axis)
+    return Vector(axis.dot(off), axis.cross(off))
 
 
 def nearest_on(mover: Mover, place: jax.Array) -> jax.Array:
     """(N, 2) m: the vehicle's nearest point to each place."""
-    along, across = _own_frame(mover, place)
-    along, across = jnp.clip(along, -mover.half[0], mover.half[0]), jnp.clip(across, -mover.half[1], mover.half[1])
-    left = jnp.stack([-mover.axis[1], mover.axis[0]])
-    return mover.centre + along[:, None] * mover.axis + across[:, None] * left
+    return _nearest_on(mover, Vector.of(place)).stacked()
 
 
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
-
-
-def _length(vector: jax.Array) -> jax.Array:
-    return jnp.sqrt(_dot(vector, vector) + 1e-12)
-
-
-def _unit(vector: jax.Array, otherwise: jax.Array) -> jax.Array:
-    length = _length(vector)[..., None]
-    return jnp.where(length > 1e-5, vector / length, otherwise)
+def _nearest_on(mover: Mover, place: Vector) -> Vector:
+    own, axis = _own_frame(mover, place), Vector.of(mover.axis)
+    along, across = (jnp.clip(at, -half, half) for at, half in ((own.x, mover.half[0]), (own.y, mover.half[1])))
+    return Vector.of(mover.centre) + axis * along + axis.left * across
