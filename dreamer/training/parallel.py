@@ -30,11 +30,11 @@ def make_mesh(devices: Sequence[jax.Device], instances: int, batch_size: int) ->
     """
     if len(devices) < 2 and jax.process_count() == 1:
         return None
-    if len(set(devices)) < len(devices):
-        raise ValueError(f"devices = {list(devices)}: one of them is there twice. Leave one out.")
     for count, what in ((instances, "instances"), (batch_size, "sequences of a batch")):
         if count % len(devices):
             raise ValueError(f"{count} {what} do not split evenly over {len(devices)} devices; change one of them.")
+    if len(set(devices)) < len(devices):
+        raise ValueError(f"devices = {list(devices)}: one of them is there twice. Leave one out.")
     return Mesh(np.asarray(devices), (AXIS,))
 
 

@@ -27,17 +27,7 @@ def first_one(peer, publisher, dataset, trial):
     odometry = message_type("nav_msgs/Odometry")()
     odometry.header.stamp.sec, odometry.pose.pose.orientation.w = 50, 1.0
     timer = peer.repeat(publisher, 0.1, lambda: odometry)
-    try:
-        peer.wait_until(lambda _: written(dataset, trial), 25)
-    except AssertionError:
-        import subprocess
-        print("THREAD", peer._thread.is_alive(), publisher.get_subscription_count(), peer.node.count_subscribers("whill/odom"))
-        print([(i.node_name, str(i.qos_profile.reliability)) for i in peer.node.get_subscriptions_info_by_topic("/whill/odom")])
-        print(list(dataset.rglob("*")), [p.read_text() for p in dataset.rglob("*.csv")])
-        print(subprocess.run("ps -eo pid,stat,args | grep 'bridge.record' | grep -v grep", shell=True, capture_output=True, text=True).stdout)
-        import time as t; t.sleep(15)
-        print([p.read_text() for p in dataset.rglob("*.csv")])
-        raise
+    peer.wait_until(lambda _: written(dataset, trial))
     timer.cancel()
 
 
@@ -64,8 +54,8 @@ def test_every_message_of_a_burst_is_recorded_once(graph, tmp_path, kind):
     first_one(peer, publisher, tmp_path / "logs", "burst_1")
     if kind == "reliable":
         publish(peer, publisher, 400)
-    else:  # while the recorder is paused, the system keeps about 100 messages, and what nobody repeats is lost
-        publish(peer, publisher, 400, 80, lambda last: written(tmp_path / "logs", "burst_1", last))
+    else:  # while the recorder is paused, the system keeps about 90 messages, and what nobody repeats is lost
+        publish(peer, publisher, 400, 40, lambda last: written(tmp_path / "logs", "burst_1", last))
     peer.wait_until(lambda _: written(tmp_path / "logs", "burst_1", 399))
     assert graph.end("record") == 0, graph.log("record")
     rows = recorded(tmp_path / "logs" / "trials" / "burst_1")

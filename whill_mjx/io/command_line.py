@@ -282,7 +282,7 @@ def _parsed(options: type, description: str | None, positional: bool, args: list
     text = " ".join(line for line in lines[1:] if line).split("For full helptext")[0].strip()
     if number := NO_NUMBER.match(text):
         kind = "whole number, in digits alone" if "int()" in text else "number"
-        raise OptionError(f"{number[1]} {number[2]}: must be a {kind}. Correct it.")
+        raise OptionError(f"{number[1]} {number[2]}: must be a {kind}. Correct it. See --help.")
     if text.startswith("Error parsing"):
         text = text.split("Argument helptext:")[0].strip()
     raise OptionError(f"{text.rstrip('.')}. See --help.")
