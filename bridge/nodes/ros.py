@@ -11,7 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, MutableMapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -381,7 +381,7 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
         executor.add_node(node)
         try:
             while not stopping and not done():
-                executor.spin_once(timeout_sec=0.1)
+                _serve(executor, 0.1)
         finally:
             executor.remove_node(node)
             executor.shutdown()
@@ -399,10 +399,18 @@ def spin_some(node: Any, seconds: float) -> None:
     executor = make_executor()
     executor.add_node(node)
     try:
-        executor.spin_once(timeout_sec=seconds)
+        _serve(executor, seconds)
     finally:
         executor.remove_node(node)
         executor.shutdown()
+
+
+def _serve(executor: Any, seconds: float) -> None:
+    """Serve what is due within a time [s]. A reader that a callback replaced by another may still have had an event."""
+    from rclpy.impl.implementation_singleton import rclpy_implementation
+
+    with suppress(rclpy_implementation.InvalidHandle):
+        executor.spin_once(timeout_sec=seconds)
 
 
 def steady_timer(node: Any, period: float, callback: Callable[[], object]) -> Any:

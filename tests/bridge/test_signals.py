@@ -126,3 +126,17 @@ def test_an_option_that_shows_only_in_the_graph_to_be_wrong_is_refused_with_one_
         run(block)
     assert ended.value.code == Exit.REFUSED and session.ended == ["bridge_test"]
     assert capsys.readouterr().err == "bridge_test: --yield-to a: is b. Leave it out.\n"
+
+
+def test_an_event_of_a_reader_that_was_replaced_by_another_does_not_end_a_node(session, monkeypatch):
+    implementation = pytest.importorskip("rclpy.impl.implementation_singleton").rclpy_implementation
+    events = [implementation.InvalidHandle("the reader is gone"), None]
+
+    def spin_once(timeout_sec):
+        if (event := events.pop(0)) is not None:
+            raise event
+
+    executor = SimpleNamespace(add_node=lambda _: None, remove_node=lambda _: None, shutdown=lambda: None,
+                               spin_once=spin_once)
+    monkeypatch.setattr(ros, "make_executor", lambda: executor)
+    assert run(lambda node: ros.spin(node, done=lambda: not events)) == Exit.DONE and not events
