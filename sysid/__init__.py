@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+import whill_mjx  # noqa: F401  # first: of a command it looks last in the current folder
+
+from importlib import import_module  # isort: skip
+from typing import TYPE_CHECKING, Any  # isort: skip
 
 if TYPE_CHECKING:
     from sysid.logs.loaders import load_any as load_any

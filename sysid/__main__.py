@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-from whill_mjx.io.command_line import guarded
+from whill_mjx.io.command_line import guarded, refuse_words
 
 COMMANDS = ("inspect", "convert", "fit", "close_loop", "design", "paper", "searches", "report", "verdict")
 
@@ -19,7 +19,8 @@ def first_line(name: str) -> str:
 
 
 def main() -> None:
-    """Print the list."""
+    """Print the list; refuse words."""
+    refuse_words("sysid", COMMANDS)
     for name in COMMANDS:
         print(f"python -m sysid.{name:<12} {first_line(name)}")
     print("Each has --help.")

@@ -7,11 +7,22 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
-if sys.argv[:1] == ["-m"] and sys.path[:1] == [os.getcwd()]:
-    sys.path.append(sys.path.pop(0))  # of a command: a user's random.py or json.py must not stand for Python's own
+
+def _look_last_in_the_current_folder() -> None:
+    """Of a command: a user's random.py or json.py must not stand for Python's own."""
+    try:
+        here, source = os.getcwd(), os.path.join(os.path.dirname(__file__), os.pardir)
+        if sys.argv[:1] == ["-m"] and sys.path[:1] == [here] and not os.path.samefile(here, source):
+            sys.path.append(sys.path.pop(0))
+    except OSError:  # the folder is gone
+        pass
+
+
+_look_last_in_the_current_folder()
+
+from importlib import import_module  # noqa: E402
+from typing import TYPE_CHECKING, Any  # noqa: E402
 
 if TYPE_CHECKING:
     from whill_mjx.batch import make_batch as make_batch

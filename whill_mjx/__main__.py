@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-from whill_mjx.io.command_line import guarded
+from whill_mjx.io.command_line import guarded, refuse_words
 
 COMMANDS = ("train", "evaluate", "drive", "look", "view", "maps", "export_mjcf", "export_python")
 
@@ -17,7 +17,8 @@ def first_line(name: str) -> str:
 
 
 def main() -> None:
-    """Print the list."""
+    """Print the list; refuse words."""
+    refuse_words("whill_mjx", COMMANDS)
     for name in COMMANDS:
         print(f"python -m whill_mjx.{name:<14} {first_line(name)}")
     print("Each has --help.")

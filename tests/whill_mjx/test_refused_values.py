@@ -107,6 +107,17 @@ def test_a_file_of_the_users_with_the_name_of_a_library_does_not_stand_for_it(tm
         assert ended.returncode == command_line.REFUSED and said in ended.stderr, ended.stderr
 
 
+@pytest.mark.parametrize(("words", "code", "said"), [
+    (["sysid"], command_line.DONE, "python -m sysid.fit"),
+    (["sysid", "fit"], command_line.REFUSED, "fit: takes no words. Type python -m sysid.fit."),
+    (["whill_mjx", "go"], command_line.REFUSED, "go: takes no words. Leave it out for the list."),
+])  # fmt: skip
+def test_a_list_of_commands_is_shown_beside_any_file_and_takes_no_words(words, code, said, tmp_path):
+    (tmp_path / "ast.py").write_text("raise RuntimeError('the file of the user')\n")
+    ended = subprocess.run([sys.executable, "-m", *words], cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode == code and said in ended.stdout + ended.stderr
+
+
 def test_a_run_without_a_policy_yet_is_refused_with_the_way_on(tmp_path):
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(command_line.OptionError, match="no policy in this run yet.*give its command again to go on"):
