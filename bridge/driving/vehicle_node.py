@@ -62,6 +62,14 @@ class Decider(Protocol):
         """Return whether the vehicle needs zeros before the node ends."""
 
 
+def clock_offset() -> float | None:
+    """Seconds by which the wall clock is ahead of the steady one; None where a pause fell between the readings."""
+    before = time.monotonic()
+    offset = time.time() - before
+    return offset if time.monotonic() - before < CLOCK_STEP / 2 else None
+
+
+
 class VehicleNode:
     """Connects one decider to the ROS graph."""
 
@@ -99,7 +107,7 @@ class VehicleNode:
         self._said_driving = False
         self._started = now()
         self._looked = self._said = -math.inf
-        self._clock_offset = time.time() - time.monotonic()
+        self._clock_offset = clock_offset()
         self._reported: tuple[str, ...] = ()
         self._others = Commanders(time.monotonic())
         self._commanders: list[str] = []
@@ -184,10 +192,11 @@ class VehicleNode:
                                 cwd=Path(__file__).resolve().parents[2])  # so that -m finds this very package
 
     def _on_watch(self) -> None:
-        now, offset = self.now(), time.time() - time.monotonic()
-        if abs(offset - self._clock_offset) > CLOCK_STEP:
-            self.supervisor.clock_jump()
-        self._clock_offset = offset
+        now, before, offset = self.now(), self._clock_offset, clock_offset()
+        if offset is not None:
+            self._clock_offset = offset
+            if before is not None and abs(offset - before) > CLOCK_STEP:
+                self.supervisor.clock_jump()
         self._inputs.watch(now)
         if self._chair is not None:
             self._chair.watch(now)

@@ -17,6 +17,7 @@ import pytest
 from bridge import __main__ as listing
 from bridge import drive, guard, manoeuvre, record, simulate
 from bridge.chair_joy import ZEROS, Expiry, JoyNode
+from bridge.driving import vehicle_node
 from bridge.nodes import parameters, ros
 from bridge.nodes.commands import finite_command
 from bridge.nodes.exits import Exit, OptionError
@@ -302,3 +303,10 @@ def test_no_message_shows_a_name_in_braces_in_place_of_its_value(path):
     known = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
     texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
     assert not [text for text in texts if known & set(re.findall(r"\{(\w+)\}", text))]
+
+
+@pytest.mark.parametrize(("readings", "offset"), [([5.0, 5.01], 95.0), ([5.0, 5.2], None)])
+def test_a_pause_between_the_readings_of_two_clocks_is_no_step_of_one(readings, offset, monkeypatch):
+    steady = iter(readings)
+    monkeypatch.setattr(vehicle_node, "time", SimpleNamespace(monotonic=lambda: next(steady), time=lambda: 100.0))
+    assert vehicle_node.clock_offset() == offset
