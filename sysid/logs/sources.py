@@ -68,6 +68,8 @@ def _about_folder(path: Path) -> str:
                 f"{packed.name} is {_about_file(packed)}")
     if text := next((one for one in files if one.suffix in (".csv", ".txt", ".tum")), None):
         return f"a folder of text files ({text.name}), not a dataset. {convert}"
+    if (path / "data").is_dir() and next((path / "data").rglob("*.parquet"), None):
+        return f"a LeRobotDataset without {LEROBOT_INFO}. Copy its folder meta too."
     return ("no dataset.toml, no *.npz and no *Robot1_Odometry.dat in it. Name the folder that holds one of them; "
             "the formats are in docs/log_format.md.")
 

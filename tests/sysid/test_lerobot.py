@@ -155,6 +155,9 @@ def test_features_without_names_ask_for_columns_and_take_them(tmp_path):
 def test_what_cannot_be_read_is_said_in_one_line_and_nothing_is_written(tmp_path, monkeypatch):
     folder = foreign(tmp_path / "base", NAMES)
     assert "LeRobotDataset" in about(folder) and "sysid.convert" in about(folder)
+    (folder / "meta/info.json").rename(folder / "info.json")
+    assert about(folder) == "a LeRobotDataset without meta/info.json. Copy its folder meta too."
+    (folder / "info.json").rename(folder / "meta/info.json")
     (folder / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1 no more")
     with pytest.raises(ValueError, match="file-000.parquet: is no whole parquet file"):
         convert(ConvertConfig(folder, tmp_path / "log"))

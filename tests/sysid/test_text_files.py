@@ -911,3 +911,14 @@ def test_what_is_no_text_is_called_what_it_is(tmp_path, begin, kind):
         read_table(tmp_path / "drive.csv")
     (tmp_path / "drive.csv").write_text("PAR1,PAR2,t\n" + "1,2,3\n" * 20)  # a text that begins like a Parquet file
     assert list(read_table(tmp_path / "drive.csv").columns) == ["PAR1", "PAR2", "t"]
+
+
+def test_rows_without_a_time_are_left_out_and_counted(tmp_path):
+    c = columns()
+    lost = np.arange(len(c["t"])) % 50 == 7
+    table = {"t": np.where(lost, np.nan, c["t"]), "cmd_v": c["cv"], "cmd_omega": c["cw"], "odom_x": c["x"],
+             "odom_y": c["y"], "odom_yaw": c["yaw"], "odom_v": c["v"], "odom_omega": c["w"]}
+    log, notes = convert(ConvertConfig(write(tmp_path / "drive.csv", table), tmp_path / "out"))
+    for stream in ("command", "odometry"):
+        assert any(f"{lost.sum()} rows of {stream} without a time left out" in one for one in notes), notes
+    assert sum(len(trial.odometry.t) for trial in log.trials) <= (~lost).sum()

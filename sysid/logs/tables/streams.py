@@ -81,10 +81,13 @@ def _rows_of_file(
     if stream == "command":  # a logger that writes what changed leaves the cell of the other part empty
         sent = np.isfinite([found[key] for key in found if key != "t"]).any(axis=0)
         found = {key: values[sent] if key == "t" else _held(values[sent]) for key, values in found.items()}
-    whole = np.isfinite(list(found.values())).all(axis=0)
-    found = {key: values[whole] for key, values in found.items()}
+    known = np.isfinite([found[key] for key in found if key != "t"]).all(axis=0)
+    timeless = known & ~np.isfinite(found["t"])
+    found = {key: values[known & ~timeless] for key, values in found.items()}
     found, unset = _with_orientation(found)
     notes = _check_clock(file, found["t"])
+    if timeless.any():
+        notes.append(f"{file}: {counted(int(timeless.sum()), 'row')} of {stream} without a time left out")
     if unset:
         notes.append(f"{file}: {counted(unset, 'row')} of {stream} with an orientation that is all zero left out")
     order = np.argsort(found["t"], kind="stable")
