@@ -55,10 +55,10 @@ loop: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.loop --out $(LOOP)
 
 test: $(VENV)/.installed-dev
-	$(call once_more,$(BIN)/python -m pytest -q -n 2 --dist loadfile --durations 30)
+	$(call once_more,$(BIN)/python -m pytest -q --cache-clear -n 2 --dist loadfile --durations 30)
 
 test-quick: $(VENV)/.installed-dev
-	$(call once_more,$(BIN)/python -m pytest -q -n 2 --dist loadfile -m quick)
+	$(call once_more,$(BIN)/python -m pytest -q --cache-clear -n 2 --dist loadfile -m quick)
 
 # Damage, kills and full disks in numbers, and the seconds of each notebook: an hour or more.
 test-long: $(VENV)/.installed-dev $(VENV)/.installed-docs
@@ -72,7 +72,7 @@ lint: $(VENV)/.installed-dev
 # Lines and branches that the suite runs; a page in build/coverage.
 coverage: $(VENV)/.installed-dev
 	$(PIP) install -q -c constraints.txt pytest-cov
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+	$(BIN)/python -m pytest -q --cache-clear -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
 
 # Renew constraints.txt: the newest versions that pyproject.toml allows, for every Python of PYTHONS. Then run the tests.
 PYTHONS ?= python3.11 python3.12 python3.13

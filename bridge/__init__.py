@@ -5,12 +5,15 @@ import signal
 import sys
 from types import FrameType
 
+COMMANDS = ("drive", "guard", "manoeuvre", "record", "simulate", "chair", "chair_joy")
+
 
 def _is_starting() -> bool:
     """Return whether this process is a command of this package whose imports are under way."""
     words = sys.orig_argv
     module = words[words.index("-m") + 1] if sys.argv[:1] == ["-m"] and "-m" in words[:-1] else ""
-    return module.partition(".")[0] == __name__ or os.path.basename(sys.argv[0]).startswith(("bridge-", "bridge_"))
+    script = os.path.basename("".join(sys.argv[:1])).removesuffix(".exe").replace("-", "_")
+    return module.partition(".")[0] == __name__ or script in {f"bridge_{name}" for name in COMMANDS}
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-COMMANDS = ("drive", "guard", "manoeuvre", "record", "simulate", "chair", "chair_joy")
+from bridge import COMMANDS
 
 
 def first_line(name: str) -> str:

@@ -51,11 +51,12 @@ def finish(writer: TrialWriter | SplitWriter) -> bool:
     try:
         if isinstance(writer, TrialWriter) and writer.is_empty:
             writer.drop()
-            print("bridge.record: nothing was recorded, so there is no trial", file=sys.stderr)
+            for line in ["nothing was recorded, so there is no trial", *left_out(writer.left_out)]:
+                print(f"bridge.record: {line}", file=sys.stderr)
             return True
         folder = writer.close()
     except OSError as error:
-        print(f"bridge.record: {error.strerror}", file=sys.stderr)
+        print(f"bridge.record: {said(error)}", file=sys.stderr)
         return False
     if isinstance(writer, TrialWriter):
         say_trial(folder, writer.rows)
@@ -124,8 +125,10 @@ def main(arguments: list[str] | None = None) -> int:
         print("bridge.record: the recording ended early, because nothing could be written any more", file=sys.stderr)
         return Exit.FAULT
     if not writer.rows["odometry"]:
-        print(f"bridge.record: no odometry was recorded: no message came on {options.odometry_topic}, or the vehicle "
-              "never moved. A fit needs it; name the vehicle's topic with --odometry-topic.", file=sys.stderr)
+        why = ("none of its messages could be used" if writer.left_out["odometry"] else
+               f"no message came on {options.odometry_topic}, or the vehicle never moved")
+        print(f"bridge.record: no odometry was recorded: {why}. A fit needs it; name the vehicle's topic with "
+              "--odometry-topic.", file=sys.stderr)
         return Exit.SHORT
     return Exit.DONE
 

@@ -85,4 +85,7 @@ def kind_of(leaf: Any) -> str:
     """Type and shape of an array, a number or an array's shape, as "float32[4, 2]"."""
     if not hasattr(leaf, "dtype") and not isinstance(leaf, bool | numbers.Number):
         return f"a {type(leaf).__name__}"
-    return f"{leaf.dtype if hasattr(leaf, 'dtype') else jnp.result_type(leaf)}{list(np.shape(leaf))}"
+    dtype = leaf.dtype if hasattr(leaf, "dtype") else jnp.result_type(leaf)
+    if not jnp.issubdtype(dtype, jax.dtypes.extended):  # a constant of numpy is of 64 bits, until JAX takes it
+        dtype = jax.dtypes.canonicalize_dtype(dtype)
+    return f"{dtype}{list(np.shape(leaf))}"

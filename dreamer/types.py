@@ -69,7 +69,7 @@ class FunctionalEnv:
 
     def __post_init__(self) -> None:
         """Raise ValueError for instances, observations, actions or functions of another kind."""
-        whole("FunctionalEnv.num_envs", self.num_envs, 1, INT32)
+        object.__setattr__(self, "num_envs", whole("FunctionalEnv.num_envs", self.num_envs, 1, INT32))
         image_shape(self.obs_shape)
         actions(self.action_dim)
         for name in ("reset", "step"):

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from functools import wraps
@@ -22,13 +23,17 @@ def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int
 
     @wraps(main)
     def guarded(arguments: list[str] | None = None) -> int:
-        with signals.heard(interrupt=True) as heard:
-            try:
-                return main(arguments)
-            except BaseException as error:  # an import may make an ImportError of it
-                if not (heard or isinstance(error, KeyboardInterrupt)):
-                    raise
-                which = signals.name_of(heard[0]) if heard else "SIGINT"
+        try:
+            with signals.heard(interrupt=True) as heard:
+                try:
+                    return main(arguments)
+                except BaseException as error:  # an import may make an ImportError of it
+                    if not (heard or isinstance(error, KeyboardInterrupt)):
+                        raise
+                    which = signals.name_of(heard[0]) if heard else "SIGINT"
+        finally:
+            if getattr(signal.getsignal(signal.SIGINT), "__module__", "") == "bridge":  # that of a command's start
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is over: nothing is left to be stopped
         name = getattr(main.__globals__.get("__spec__"), "name", "bridge")
         print(f"{name}: stopped ({which})", file=sys.stderr)
         return Exit.STOPPED

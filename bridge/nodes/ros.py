@@ -44,6 +44,8 @@ DRIVE_NAME = "bridge_drive"
 GUARD_NAME = "bridge_guard"
 RECORD_NAME = "bridge_record"
 MANOEUVRE_NAME = "bridge_manoeuvre"
+INVALID = 10
+"""Rounds without a pause in which an entity of ROS is no longer valid, after which that is an error."""
 ENDLESS = 10**18
 """Nanoseconds from which a deadline or a lease is none: DDS has 2^63 - 1 for it."""
 PROFILE = Path(__file__).parents[1] / "fastdds.xml"
@@ -313,7 +315,7 @@ def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bo
             finally:
                 stopping.clear()  # `spin` has heeded them
         except OptionError as error:  # one that shows only in the graph
-            print(f"{name}: {error}", file=sys.stderr)
+            print(f"{name.replace('_', '.', 1)}: {error}", file=sys.stderr)
             raise SystemExit(int(Exit.REFUSED)) from None
         finally:
             import rclpy
@@ -380,8 +382,9 @@ def spin(node: Any, done: Callable[[], bool] = lambda: False) -> None:
         gc.freeze()  # what is there by now stays, so no later collection looks through it and delays a command
         executor.add_node(node)
         try:
+            serve = _server(executor)
             while not stopping and not done():
-                _serve(executor, 0.1)
+                serve(0.1)
         finally:
             executor.remove_node(node)
             executor.shutdown()
@@ -399,18 +402,33 @@ def spin_some(node: Any, seconds: float) -> None:
     executor = make_executor()
     executor.add_node(node)
     try:
-        _serve(executor, seconds)
+        _server(executor)(seconds)
     finally:
         executor.remove_node(node)
         executor.shutdown()
 
 
-def _serve(executor: Any, seconds: float) -> None:
-    """Serve what is due within a time [s]. A reader that a callback replaced by another may still have had an event."""
+def _server(executor: Any) -> Callable[[float], None]:
+    """A function that serves what is due within a time [s].
+
+    A reader that a callback has just replaced by another may still have had an event. An entity that is invalid again
+    and again is an error.
+    """
     from rclpy.impl.implementation_singleton import rclpy_implementation
 
-    with suppress(rclpy_implementation.InvalidHandle):
-        executor.spin_once(timeout_sec=seconds)
+    again = 0
+
+    def serve(seconds: float) -> None:
+        nonlocal again
+        try:
+            executor.spin_once(timeout_sec=seconds)
+            again = 0
+        except rclpy_implementation.InvalidHandle:
+            again += 1
+            if again > INVALID:
+                raise
+
+    return serve
 
 
 def steady_timer(node: Any, period: float, callback: Callable[[], object]) -> Any:
@@ -500,7 +518,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
         temporary.write_text(json.dumps(content) + "\n")
         os.replace(temporary, path)
     except OSError:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise
 
 
@@ -509,8 +528,8 @@ def write_results(program: str, path: Path, content: dict[str, Any]) -> bool:
     try:
         write_json(path, content)
     except OSError as error:
-        print(f"{program}: --results {path}: {error.strerror}. The results are not written. Make room there, or choose "
-              "another place.", file=sys.stderr)
+        print(f"{program}: --results {path}: {error.strerror or error}. The results are not written. Make room there, "
+              "or choose another place.", file=sys.stderr)
         return False
     return True
 

@@ -1,5 +1,5 @@
-"""Signals that end a command. They are noted in a list, since the exception of one may be lost: in a callback of the
-garbage collector, or in the import of a C extension, which turns it into an ImportError."""
+"""Signals that end a command. Their handlers note them in a list, because a KeyboardInterrupt can get lost: in a
+callback of the garbage collector, or in the import of a C extension, which turns it into an ImportError."""
 
 import signal
 from collections.abc import Iterator

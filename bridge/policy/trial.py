@@ -81,8 +81,8 @@ class Trial:
         try:
             given = json.dumps(request).encode() + b"\n" + network
             said = self._process.communicate(given, WALL_SECONDS)
-            told, errors = (text.decode("utf-8", "replace") for text in said)
-            granted, _, answer = told.partition("\n")
+            output, errors = (text.decode("utf-8", "replace") for text in said)
+            granted, _, answer = output.partition("\n")
             allowed = f"{granted} of processor time"
         except subprocess.TimeoutExpired:
             self._process.kill()

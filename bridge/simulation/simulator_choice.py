@@ -4,6 +4,8 @@ import argparse
 import importlib
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from bridge.nodes.exits import OptionError
@@ -20,22 +22,29 @@ def ready_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     Raises:
         ValueError, FileNotFoundError: as of `make_vehicle`, or a simulator of the user's own ended in an error.
     """
-    try:
-        vehicle = make_vehicle(options)
-        print("bridge.simulate: compiling the simulator: up to a minute where it has not run before", file=sys.stderr)
+    vehicle = make_vehicle(options)
+    print("bridge.simulate: compiling the simulator: up to a minute where it has not run before", file=sys.stderr)
+    with _placed(options.simulator):
         vehicle.reset(options.seed)
         vehicle.step(0.0, 0.0)
-    except (ValueError, FileNotFoundError):
+    return vehicle
+
+
+@contextmanager
+def _placed(simulator: str) -> Iterator[None]:
+    """Turn any error in a simulator of the user's own into an OptionError with the line where it happened."""
+    try:
+        yield
+    except OptionError:
         raise
     except Exception as error:
-        if options.simulator == SIMULATOR:
+        if simulator == SIMULATOR:
             raise
         places = [f"{one.filename}, line {one.lineno}: " for one in traceback.extract_tb(error.__traceback__)
                   if one.filename != __file__ and not one.filename.startswith("<")]
-        raise OptionError(f"--simulator {options.simulator}: {places[-1] if places else ''}{type(error).__name__}: "
-                          f"{error}. It must be MODULE:FACTORY, called with task and vehicle, and give what "
-                          "SimulatedVehicle says. Correct it.") from error
-    return vehicle
+        raise OptionError(f"--simulator {simulator}: {places[-1] if places else ''}{type(error).__name__}: {error}. It "
+                          "must be MODULE:FACTORY, called with task and vehicle, and give what SimulatedVehicle says. "
+                          "Correct it.") from error
 
 
 def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
@@ -45,11 +54,12 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
         ValueError, FileNotFoundError: an option, or the policy's folder, is refused.
     """
     module, _, name = options.simulator.partition(":")
-    try:
-        factory = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise OptionError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task and "
-                          "vehicle. Correct it or leave it out.") from error
+    with _placed(options.simulator):
+        try:
+            factory = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise OptionError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task "
+                              "and vehicle. Correct it or leave it out.") from error
     changes = dict(options.set)
     if options.policy is None:
         given = {"task": options.task or "corridor", "vehicle": options.vehicle, **changes}
@@ -64,7 +74,8 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
     if options.robot is None:
         if options.wheels:
             raise OptionError("--wheels names the wheels of a robot file. Give --robot too, or leave it out.")
-        return factory(**given)
+        with _placed(options.simulator):
+            return factory(**given)
     from sysid.replay.robot_online import OnlineRobot
     from whill_mjx.env import as_vehicle
 

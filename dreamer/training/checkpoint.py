@@ -33,6 +33,8 @@ LEAST_S, SHARE = 60.0, 0.05
 """Time between checkpoints [s] and share of the run's time that they take at most, where no interval is asked for."""
 UNFINISHED = ".unfinished-"
 SCHEMA = 1
+LEARNED = ("params.", "agent.params.", "agent.average.")
+"""Where a state has parameters that are learned. An infinite one of a vehicle, in env_state.params, means no limit."""
 ENTRIES = {"config": dict, "files": dict, "env_steps": int, "wall_s": int | float}
 """Entries of meta.json and their kinds."""
 
@@ -80,7 +82,9 @@ class Pace:
         return time.monotonic() - self._ended >= self.every_s
 
 
-def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | None = None) -> Path:
+def save(
+    folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | None = None, seeds: int = 0
+) -> Path:
     """Write a checkpoint and return its path; older ones beyond the last two are removed afterwards.
 
     Args:
@@ -90,9 +94,10 @@ def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | Non
         moment: of the training.
         rows: (path prefix, used rows, all rows): leaves below the prefix whose first axis has `all rows` are cut to the
             used ones, so that a replay that is not full costs no more than it holds.
+        seeds: in a state of several seeds, how many; each leaf has them in its first axis.
 
     Raises:
-        CheckpointError: parameters that are no finite numbers; earlier checkpoints stay.
+        CheckpointError: parameters that are no finite numbers, of all seeds; earlier checkpoints stay.
     """
     import orbax.checkpoint as ocp
 
@@ -101,7 +106,7 @@ def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | Non
     env_steps, wall_s, pretraining = moment
     target = folder / (f"{env_steps:012d}.{pretraining:012d}" if pretraining else f"{env_steps:012d}")
     arrays = {name: _to_numpy(leaf, name, rows) for name, leaf in _named_leaves(state).items()}
-    _check_parameters(folder, arrays)
+    _check_parameters(folder, arrays, seeds)
     if not parallel.is_first_process():
         return target
     temporary = folder / f"{UNFINISHED}{target.name}-{uuid.uuid4().hex}"  # an interrupted writer may still use its own
@@ -131,11 +136,13 @@ def save(folder: Path, state: Any, config: Any, moment: Moment, rows: Rows | Non
     return target
 
 
-def _check_parameters(folder: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Refuse to keep a network that has diverged, in place of an earlier one that works."""
-    found = {name: array for name, array in arrays.items() if "params" in name.split(".")}
-    wrong = [name for name, array in found.items() if not np.isfinite(array.astype(np.float32)).all()]
-    if wrong:
+def _check_parameters(folder: Path, arrays: dict[str, np.ndarray], seeds: int) -> None:
+    """Refuse to keep a network that has diverged, in place of an earlier one that works; one seed of several may."""
+    found = {name: array for name, array in arrays.items() if name.startswith(LEARNED)}
+    finite = {name: np.isfinite(array.astype(np.float32)).reshape(seeds or 1, -1).all(1)
+              for name, array in found.items()}  # fmt: skip
+    wrong = [name for name, each in finite.items() if not each.all()]
+    if wrong and not np.all(list(finite.values()), axis=0).any():
         there = ", ".join(path.name for path in complete(folder)) or "none"
         raise CheckpointError(
             f"{folder}: {len(wrong)} of {len(found)} arrays of parameters hold values that are no finite numbers (such "

@@ -115,6 +115,6 @@ def save_state(out: Path, state: TrainState, config: DreamerConfig, wall_s: floa
     pretraining = 0 if env_steps else sum(pretrain.counters(state).values())
     state = host_replay.revealed(state)
     moment = checkpoint.Moment(env_steps, wall_s, pretraining)
-    path = checkpoint.save(out / "checkpoints", state, config, moment, filled)
+    path = checkpoint.save(out / "checkpoints", state, config, moment, filled, seeds.count(state.agent.params))
     parallel.wait_for_all("checkpoint written")  # only the first process writes; the others may read it next
     return path

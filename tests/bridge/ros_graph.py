@@ -157,5 +157,5 @@ class Graph:
         mark = f"ROS_LOG_DIR={self.environment['ROS_LOG_DIR']}\0".encode()
         for path in Path("/proc").glob("[0-9]*/environ"):
             with contextlib.suppress(OSError):
-                if mark in path.read_bytes() + b"\0":
+                if mark in path.read_bytes() + b"\0" and int(path.parent.name) != os.getpid():
                     yield int(path.parent.name)

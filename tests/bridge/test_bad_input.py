@@ -243,6 +243,8 @@ def test_the_joystick_is_left_to_its_rider_at_the_end_unless_a_command_moved_the
     ("def make(:", "SyntaxError"), ("def make(task):\n    pass", "unexpected keyword argument"),
     ("def make(**k):\n    raise RuntimeError('no port')", "simulator_of_mine.py, line 2"),
     ("def make(**k):\n    return 3", "no attribute 'reset'"),
+    ("def make(**k):\n    open('no.urdf')", "simulator_of_mine.py, line 2.*no.urdf"),
+    ("def make(**k):\n    raise ValueError('of shape (3,)')", "simulator_of_mine.py, line 2.*shape"),
 ])  # fmt: skip
 def test_an_error_in_a_simulator_of_the_users_own_is_one_line_with_its_place(source, told, tmp_path, monkeypatch):
     (tmp_path / "simulator_of_mine.py").write_text(source)

@@ -1,4 +1,4 @@
-"""Any bytes give commands, parameters, a message or an image, or the documented error, within 2 s and 500 MB."""
+"""Any bytes give commands, parameters, a message or an image, or the documented error, within bounds of cost."""
 
 import contextlib
 import csv

@@ -125,7 +125,7 @@ def test_an_option_that_shows_only_in_the_graph_to_be_wrong_is_refused_with_one_
     with pytest.raises(SystemExit) as ended:
         run(block)
     assert ended.value.code == Exit.REFUSED and session.ended == ["bridge_test"]
-    assert capsys.readouterr().err == "bridge_test: --yield-to a: is b. Leave it out.\n"
+    assert capsys.readouterr().err == "bridge.test: --yield-to a: is b. Leave it out.\n"
 
 
 def test_an_event_of_a_reader_that_was_replaced_by_another_does_not_end_a_node(session, monkeypatch):

@@ -147,12 +147,22 @@ def test_a_device_that_is_there_twice_is_refused():
 
 @pytest.mark.parametrize("value", [NAN, INF])
 def test_a_network_that_has_diverged_replaces_no_checkpoint(value, tmp_path):
-    good = {"agent": {"params": {"w": np.ones(3, np.float32)}, "other": np.full(2, INF)}}
+    good = {"agent": {"params": {"w": np.ones(3, np.float32)}, "other": np.full(2, INF)},
+            "env_state": {"params": {"limit": np.float32(INF)}}}
     kept = checkpoint.save(tmp_path, good, CONFIG, checkpoint.Moment(10))
     bad = {"agent": {**good["agent"], "params": {"w": np.array([1, value], np.float32)}}}
     with pytest.raises(checkpoint.CheckpointError, match="agent.params.w.*diverged.*NaN.*here: 000000000010"):
         checkpoint.save(tmp_path, bad, CONFIG, checkpoint.Moment(20))
     assert [kept] == list(tmp_path.iterdir())
+
+
+def test_one_diverged_seed_of_several_ends_no_training(tmp_path):
+    def state(*values):
+        return {"agent": {"params": {"w": np.array([[1, value] for value in values], np.float32)}}}
+
+    assert checkpoint.save(tmp_path, state(1, np.nan), CONFIG, checkpoint.Moment(10), seeds=2).exists()
+    with pytest.raises(checkpoint.CheckpointError, match="diverged"):
+        checkpoint.save(tmp_path, state(INF, np.nan), CONFIG, checkpoint.Moment(20), seeds=2)
 
 
 class Line(gymnasium.Env):

@@ -101,16 +101,18 @@ def one_of_three_is_killed(storage, evaluations, tmp_path):
     place = storage if isinstance(storage, str) else storage.url
     first = start_worker(place, evaluations, 0.3, gate=tmp_path / "never")
     second = start_worker(place, evaluations, 0.6, gate=tmp_path / "gate")
+    workers = [first, second]
     try:
         wait_for(lambda: (tmp_path / "never.reached").exists() and candidates_of(storage, second))
         first.kill()
         first.wait()
-        third = start_worker(place, evaluations, 0.05)
+        workers.append(third := start_worker(place, evaluations, 0.05))
         wait_for(lambda: candidates_of(storage, third))
         (tmp_path / "gate").touch()
         assert second.wait(LONG) == third.wait(LONG) == 0
     finally:
-        first.kill(), second.kill()  # whatever has failed, nobody waits at a gate for ever
+        for worker in workers:  # whatever has failed, nobody waits at a gate for ever
+            worker.kill()
     return first
 
 

@@ -120,5 +120,5 @@ def test_a_list_of_commands_is_shown_beside_any_file_and_takes_no_words(words, c
 
 def test_a_run_without_a_policy_yet_is_refused_with_the_way_on(tmp_path):
     (tmp_path / "run.json").write_text("{}")
-    with pytest.raises(command_line.OptionError, match="no policy in this run yet.*give its command again to go on"):
+    with pytest.raises(command_line.OptionError, match="no policy in this folder.*give its command again to go on"):
         find_policy(tmp_path)

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from whill_mjx.effects.base import PLACES, Effect, place_of
 from whill_mjx.effects.card import Card
@@ -95,7 +96,8 @@ def make_effect(name: str, **values: float) -> Effect:
         if not isinstance(value, jax.Array):
             about = known[field]
             allowed = parameter_field(f"{name}.{field}", about.unit, about.low, about.high, about.neutral)
-            check(f"effect {name!r}", allowed, value, field)
+            for number in np.unique(value) if isinstance(value, np.ndarray) else (value,):
+                check(f"effect {name!r}", allowed, number, field)
     effect = EFFECTS[name](**values)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(float)), effect)
 

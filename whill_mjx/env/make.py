@@ -135,6 +135,8 @@ def _check_values(spec: VehicleSpec, params: VehicleParams) -> None:
         for name, about in parameters_of(owner).items():
             value, dotted = getattr(owner, name), f"{holder}.{name}"
             allowed = parameter_field(dotted, about.unit, about.low, about.high, about.neutral, sizes)
+            low, high = (float(np.float32(end)) for end in (allowed.low, allowed.high))  # as the value was rounded
+            allowed = dataclasses.replace(allowed, low=min(low, allowed.low), high=max(high, allowed.high))
             for number in () if isinstance(value, jax.core.Tracer) else np.unique(np.asarray(value)):
                 check(f"vehicle {spec.name!r}", allowed, number)
 

@@ -49,8 +49,8 @@ def find_policy(path: str | Path) -> Path:
     if (path / "policy.json").is_file():
         return path
     if (path / RUN_FILE).is_file() and not inside.exists():
-        raise OptionError(f"{path}: there is no policy in this run yet. A training exports it at its end: wait for it, "
-                          "or give its command again to go on.")
+        raise OptionError(f"{path}: there is no policy in this folder. A training exports it at its end: wait for it, "
+                          "give its command again to go on, or give the folder of a training.")
     return inside if (inside / "policy.json").is_file() else path
 
 
