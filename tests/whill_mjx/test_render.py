@@ -9,10 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from whill_mjx.world.render import FIRST_BOX, GROUND, MARKER, SKY, pinhole, render, render_frame
+from whill_mjx.world.render import (
+    FIRST_BOX,
+    GROUND,
+    MARKER,
+    SKY,
+    Quality,
+    camera_rotation,
+    image,
+    pinhole,
+    render,
+    render_frame,
+)
 from whill_mjx.world.render.blocks import in_blocks
 from whill_mjx.world.render.visibility import reciprocal
 from whill_mjx.world.scene import Boxes, Marker, Scene, box, default_looks, no_boxes, stack_boxes
+from whill_mjx.world.solids import Blocks, Rounds, Solids
 
 EYE = jnp.array([0.0, 0.0, 1.0])
 LEVEL = jnp.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along +x
@@ -183,3 +195,40 @@ def test_images_in_blocks_are_those_drawn_whole_and_are_traced_once_for_an_image
     found = jax.jit(jax.vmap(drawn, (None, 0)) if images else drawn)(rows, level)
     assert len(traced) <= traces
     np.testing.assert_array_equal(found, rows[:, None] * level[..., None, None] + jnp.arange(3.0))
+
+
+def crowded(key):
+    """Upright boxes, blocks and rounds around the camera, which is within some of them."""
+    keys = jax.random.split(key, 6)
+    boxes = dataclasses.replace(random_scene(keys[0], 30).boxes, mask=jax.random.bernoulli(keys[1], 0.8, (30,)))
+    centre = jax.random.uniform(keys[2], (12, 3), minval=-3.0, maxval=3.0) + jnp.array([0.0, 0.0, 1.0])
+    way = jax.random.normal(keys[3], (12, 3))
+    way = way / jnp.linalg.norm(way, axis=1, keepdims=True)
+    colour, there = jax.random.uniform(keys[4], (12, 3)), jax.random.bernoulli(keys[5], 0.8, (12,))
+    size = jnp.full(12, 0.3)
+    rounds = Rounds(centre, way, size, size / 2, jnp.arange(12) % 2 > 0, colour, there)
+    turn = jax.vmap(lambda yaw, pitch: camera_rotation(yaw=yaw, pitch=pitch, roll=0.4))(way[:, 0], way[:, 1])
+    blocks = Blocks(-centre, size[:, None] * jnp.array([1.0, 2.0, 0.5]), turn, colour, there)
+    return dataclasses.replace(scene_of(marker_x=3.0), boxes=boxes, solids=Solids(blocks, rounds))
+
+
+@pytest.mark.parametrize("lens, quality", [
+    (LENS, Quality()), (pinhole(1.0, width=50, height=40), Quality(antialias=True)),
+    (dataclasses.replace(LENS, distortion=jnp.array([-0.2, 0.05, 0.01, 0.0, 0.0])), Quality(shadows=True)),
+])  # fmt: skip
+def test_an_image_in_strips_that_meet_what_they_can_show_is_the_same_to_the_last_bit(lens, quality, monkeypatch):
+    scenes = jax.vmap(crowded)(jax.random.split(jax.random.key(2), 6))
+    turns = jax.vmap(lambda yaw: camera_rotation(yaw=yaw, pitch=0.3, roll=0.3 * yaw))(jnp.linspace(-3.0, 3.0, 6))
+    eyes = jnp.linspace(-1.0, 1.0, 18).reshape(6, 3) + EYE
+
+    def images():
+        every = jax.jit(jax.vmap(lambda eye, turn, scene: render(eye, turn, lens, scene, quality)))(eyes, turns, scenes)
+        first = jax.jit(lambda eye, turn, scene: render(eye, turn, lens, scene, quality))
+        return np.asarray(every), np.asarray(first(eyes[0], turns[0], jax.tree.map(lambda leaf: leaf[0], scenes)))
+
+    in_strips = images()
+    monkeypatch.setattr(image, "MANY", 10**6)
+    whole = images()
+    for one, other in zip(in_strips, whole, strict=True):
+        assert len(np.unique(other)) > 50
+        np.testing.assert_array_equal(one, other)

@@ -11,14 +11,16 @@ from whill_mjx.devices import platform
 
 BLOCK = 16
 """Images of a block: of 64x64 pixels, a quarter of a megabyte for each number of a pixel."""
+IMAGES = "images"
+"""Name of the axis of the images of a block, for collective operations."""
 
 
-def in_blocks(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+def in_blocks(function: Callable[..., jax.Array], images: int = BLOCK) -> Callable[..., jax.Array]:
     """`function` (rows (H,), ...) -> (H, ...) of one image, on a processor in a loop over blocks.
 
     XLA joins all that is computed between two loops, and computes it anew wherever it is used: the tables of an image
     in each pixel, a pixel for each of its bytes. What enters a loop or leaves it is computed once. A block is a half of
-    a single image, or several whole images under `vmap`. The result has no derivative.
+    a single image, or several whole `images` under `vmap`. The result has no derivative.
     `function` gets every array as an argument: one that it closes over is lost under `vmap` of a loop.
     """
     if platform() != "cpu":
@@ -27,13 +29,14 @@ def in_blocks(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
     @jax.custom_batching.custom_vmap
     def in_halves(rows: jax.Array, *args):  # type: ignore[no-untyped-def]
         size = -(-rows.shape[0] // 2)
-        return _assembled(lambda first: function(_part(rows, first, size), *args), rows.shape[0], size)
+        alone = jax.vmap(function, None, axis_name=IMAGES, axis_size=1)  # so that the axis has its name here too
+        return _assembled(lambda first: alone(_part(rows, first, size), *args)[0], rows.shape[0], size)
 
     @in_halves.def_vmap
     def by_images(count: int, batched: list, *args):  # type: ignore[no-untyped-def]
         chosen = tuple(batched)
-        every = jax.vmap(function, jax.tree.map(lambda one: 0 if one else None, chosen))
-        size = -(-count // max(2, -(-count // BLOCK)))  # a loop of one round is none to XLA
+        every = jax.vmap(function, jax.tree.map(lambda one: 0 if one else None, chosen), axis_name=IMAGES)
+        size = -(-count // max(2, -(-count // images)))  # a loop of one round is none to XLA
 
         def block(first: jax.Array) -> jax.Array:
             return every(*jax.tree.map(lambda leaf, one: _part(leaf, first, size) if one else leaf, args, chosen))

@@ -170,19 +170,38 @@ def shown_bounds(sides: Sides, mask: jax.Array) -> Bounds:
     return Bounds(*(jnp.where(shown, one, nothing) for one, nothing in zip((*sides[:4], near), NO_SIDES, strict=False)))
 
 
+class Members(NamedTuple):
+    """Which of P primitives each upright strip of an image can show."""
+
+    order: jax.Array  # (strips, P) int32: those first, then any
+    used: jax.Array  # (strips,) int32: how many those are
+
+
+def strip_members(boxes: Bounds, view: View, strips: int) -> Members:
+    """The primitives of each strip, in the order of their numbers. The last strip may reach beyond the image."""
+    shown = _in_strips(boxes, view, strips)
+    number = jnp.broadcast_to(jnp.arange(shown.shape[1]), shown.shape)
+    place = jnp.where(shown, jnp.cumsum(shown, 1) - 1, shown.shape[1])
+    order = jnp.zeros(shown.shape, jnp.int32).at[jnp.arange(strips)[:, None], place].set(number, mode="drop")
+    return Members(order, jnp.sum(shown, 1))
+
+
+def _in_strips(boxes: Bounds, view: View, strips: int) -> jax.Array:
+    """(strips, P) bool; with a distorting lens every strip can show all that the image can."""
+    size = -(-view.intrinsics.width // strips)
+    edges = jnp.arange(strips + 1) * float(size)
+    intrinsics = view.intrinsics
+    low, high = ((edge - intrinsics.cx) / intrinsics.fx for edge in (edges[:-1], edges[1:]))
+    if intrinsics.distortion is not None:
+        low, high = jnp.full_like(low, -NOTHING), jnp.full_like(high, NOTHING)
+    return (boxes.low_u <= high[:, None]) & (boxes.high_u >= low[:, None]) & (boxes.near < NOTHING)
+
+
 def strip_lists(boxes: Bounds, view: View, strips: int, keep: int) -> jax.Array:
     """(strips, keep) int32: the nearest boxes that each upright strip of the image can show; -1 is none.
 
     With a distorting lens the whole image is one strip.
     """
-    size = -(-view.intrinsics.width // strips)
-    edges = jnp.arange(strips + 1) * float(size)
-    left, right = edges[:-1], edges[1:]
-    intrinsics = view.intrinsics
-    low, high = ((edge - intrinsics.cx) / intrinsics.fx for edge in (left, right))
-    if intrinsics.distortion is not None:
-        low, high = jnp.full_like(low, -NOTHING), jnp.full_like(high, NOTHING)
-    shown = (boxes.low_u <= high[:, None]) & (boxes.high_u >= low[:, None]) & (boxes.near < NOTHING)
-    near = jnp.where(shown, boxes.near, NOTHING)  # (strips, P)
+    near = jnp.where(_in_strips(boxes, view, strips), boxes.near, NOTHING)  # (strips, P)
     value, place = jax.lax.top_k(-near, keep)
     return jnp.where(value > -NOTHING, place, -1)

@@ -8,6 +8,7 @@ images are drawn in blocks (`blocks`), and the tables are complete before the fi
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,10 +16,21 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from whill_mjx.devices import platform
 from whill_mjx.world.render import visibility
-from whill_mjx.world.render.blocks import in_blocks
+from whill_mjx.world.render.blocks import IMAGES, in_blocks
 from whill_mjx.world.render.camera import Intrinsics
-from whill_mjx.world.render.culling import strip_lists, upright_bounds
+from whill_mjx.world.render.culling import (
+    Eye,
+    Members,
+    block_body,
+    bounds,
+    round_body,
+    strip_lists,
+    strip_members,
+    upright_body,
+    upright_bounds,
+)
 from whill_mjx.world.render.rich import Everywhere
 from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
@@ -27,6 +39,10 @@ from whill_mjx.world.scene import Scene
 
 UNROLL = 8
 """Boxes tested in one loop round."""
+MANY = 24
+"""Primitives from which a processor lists those that each strip of an image can show; else each pixel meets all."""
+STRIPS, AT_ONCE = 16, 2
+"""Those upright strips, and how many primitives of a list are tested in one round of a loop."""
 PLAIN = Quality()
 
 
@@ -122,13 +138,39 @@ def unpack_colours(word: jax.Array) -> jax.Array:
 
 def _words(view: View, finite: jax.Array, stage: Arrays, quality: Quality) -> jax.Array:
     """(H, W) uint32 colours of an image."""
+    rows, columns = _grid(view.intrinsics)
 
-    def drawn(rows: jax.Array, columns: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
-        word = pack_channels(stage, pixel_colours(view, stage, quality, rows[:, None], columns))
+    def drawn(stage: Arrays, row: jax.Array, column: jax.Array, view: View, finite: jax.Array) -> jax.Array:
+        word = pack_channels(stage, pixel_colours(view, stage, quality, row, column))
         return jnp.where(finite, word, jnp.uint32(0))
 
-    rows, columns = _grid(view.intrinsics)
-    return in_blocks(drawn)(rows[:, 0], columns, view, finite, stage)
+    def some_rows(rows: jax.Array, column: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
+        return drawn(stage, rows[:, None], column, view, finite)
+
+    few = stage.parts.labels - MARKER < MANY
+    if platform() != "cpu" or few or stage.lists is not None:
+        return in_blocks(some_rows)(rows[:, 0], columns, view, finite, stage)
+    size = -(-view.intrinsics.width // STRIPS)
+
+    def some_strips(numbers: jax.Array, row: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
+        members = jax.tree.map(lambda leaf: leaf[numbers], stage.members)
+        column = numbers[:, None, None] * float(size) + jnp.arange(float(size))[:, None]
+        return drawn(dataclasses.replace(stage, members=members), row, column, view, finite)
+
+    stage = dataclasses.replace(stage, members=_members(view, stage.parts))
+    words = in_blocks(some_strips, 1)(jnp.arange(STRIPS), rows[:, 0], view, finite, stage)
+    return words.reshape(STRIPS * size, -1)[: view.intrinsics.width].T
+
+
+def _members(view: View, parts: Parts) -> dict[str, Members]:
+    """Of each kind of primitives, those that each strip can show."""
+    eye, boxes, blocks, rounds = Eye(view.position, view.rotation), parts.boxes, parts.blocks, parts.rounds
+    found = {"upright": bounds(eye, upright_body(boxes), boxes.mask)}
+    if blocks is not None:
+        found["block"] = bounds(eye, block_body(blocks), blocks.mask)
+    if rounds is not None:
+        found["round"] = bounds(eye, round_body(rounds), rounds.mask)
+    return {kind: strip_members(one, view, STRIPS) for kind, one in found.items()}
 
 
 def _grid(intrinsics: Intrinsics) -> tuple[jax.Array, jax.Array]:
@@ -144,8 +186,8 @@ def _stage(view: View, scene: Scene, quality: Quality, rows: bool = False) -> Ar
     tables = jax.lax.optimization_barrier(tables)
     lists = None
     if quality.keep is not None and quality.keep < parts.boxes.yaw.shape[0]:
-        bounds = upright_bounds(view, parts.boxes)
-        lists = jax.lax.optimization_barrier(strip_lists(bounds, view, quality.strips, quality.keep))
+        seen = upright_bounds(view, parts.boxes)
+        lists = jax.lax.optimization_barrier(strip_lists(seen, view, quality.strips, quality.keep))
     atlas = None if scene.finish is None else scene.finish.atlas
     return Arrays(parts, tables, lists, atlas, lit_words(scene))
 
@@ -159,6 +201,8 @@ class Arrays(Everywhere):
     lists: jax.Array | None  # (strips, keep) boxes of each strip, or None: all
     atlas: jax.Array | None
     lit_words: bool = struct.field(pytree_node=False)
+    members: dict[str, Members] | None = None
+    """What each strip can show: pixels are then (..., strips, columns, rows)."""
 
     @property
     def bits(self) -> int:
@@ -178,23 +222,25 @@ class Arrays(Everywhere):
 
     def nearest(self, rays: Rays) -> jax.Array:
         parts, tables, bits = self.parts, self.tables, self.bits
+        first = {"upright": MARKER, "block": parts.first_block, "round": parts.first_round}
+        square, reach_z = visibility.ray_square(rays), jnp.abs(rays.inverse_z)
+        keys: dict[str, Callable] = {
+            "upright": lambda numbers, code: visibility.upright_key(rays, reach_z, numbers, code, bits),
+            "block": lambda numbers, code: visibility.block_key(rays, numbers, code, bits),
+            "round": lambda numbers, code: visibility.round_key(rays, square, numbers, code, bits),
+        }
+        if self.members is not None:
+            key = jnp.full(jnp.broadcast_shapes(*(one.shape for one in rays)), FAR, jnp.int32)
+            for kind, members in self.members.items():
+                key = _least_of_members(key, keys[kind], getattr(tables, kind), members, first[kind])
+            return key
         if self.lists is None:
             key = _nearest_upright(rays, tables.upright, None, bits)
         else:
             key = _nearest_in_strips(rays, tables.upright, self.lists, bits)
-        if tables.block is not None:
-
-            def block_key(numbers, index):
-                return visibility.block_key(rays, numbers, 4 * (parts.first_block + index), bits)
-
-            key = _least(key, block_key, tables.block)
-        if tables.round is not None:
-            square = visibility.ray_square(rays)
-
-            def round_key(numbers, index):
-                return visibility.round_key(rays, square, numbers, 4 * (parts.first_round + index), bits)
-
-            key = _least(key, round_key, tables.round)
+        for kind in ("block", "round"):
+            if (table := getattr(tables, kind)) is not None:
+                key = _least(key, keys[kind], table, first[kind])
         return key
 
     def invert(self, x) -> jax.Array:
@@ -275,13 +321,35 @@ def _nearest_upright(rays: Rays, table, order, bits: int) -> jax.Array:
     return jax.lax.fori_loop(0, rounds, one_round, jnp.full(rays.x.shape, FAR, jnp.int32))
 
 
-def _least(key, key_of_one, table) -> jax.Array:
-    """Minimum of `key` and the keys of all lines of a table, as a loop that XLA does not unroll."""
+def _least(key: jax.Array, key_of_one: Callable, table: jax.Array, first: int) -> jax.Array:
+    """Minimum of `key` and the keys of all lines of a table, labelled from `first` on. XLA does not unroll the loop."""
 
     def one(index, least):
-        return jnp.minimum(least, key_of_one(table[index], index))
+        return jnp.minimum(least, key_of_one(table[index], 4 * (first + index)))
 
     return jax.lax.fori_loop(0, table.shape[0], one, key)
+
+
+def _least_of_members(
+    key: jax.Array, key_of_one: Callable, table: jax.Array, members: Members, first: int
+) -> jax.Array:
+    """Minimum of `key` (..., strips, columns, rows) and the keys of all that the strips can show, and perhaps of more.
+
+    As many as the fullest strip of these images needs are compared; what is compared in vain misses the rays.
+    """
+    strips, count = members.order.shape
+    order = jnp.pad(members.order, ((0, 0), (0, -count % AT_ONCE)))
+
+    def one_round(number, key):
+        places = jax.lax.dynamic_slice(order, (0, number * AT_ONCE), (strips, AT_ONCE))
+        rows = table[places]
+        for one in range(AT_ONCE):
+            numbers = [rows[:, one, column, None, None] for column in range(table.shape[1])]
+            key = jnp.minimum(key, key_of_one(numbers, 4 * (first + places[:, one, None, None])))
+        return key
+
+    fullest = jax.lax.pmax(jnp.max(members.used), IMAGES)
+    return jax.lax.fori_loop(0, (fullest + AT_ONCE - 1) // AT_ONCE, one_round, key)
 
 
 def _nearest_in_strips(rays: Rays, table, lists, bits: int) -> jax.Array:
