@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import whill_mjx  # noqa: F401  # first: of a command it looks last in the current folder
+import whill_mjx  # noqa: F401  # first: it makes a command search the current folder last
 
 from importlib import import_module  # isort: skip
 from typing import TYPE_CHECKING, Any  # isort: skip

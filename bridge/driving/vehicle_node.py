@@ -69,7 +69,6 @@ def clock_offset() -> float | None:
     return offset if time.monotonic() - before < CLOCK_STEP / 2 else None
 
 
-
 class VehicleNode:
     """Connects one decider to the ROS graph."""
 

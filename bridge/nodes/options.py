@@ -33,7 +33,7 @@ def ends_at_ctrl_c(main: Callable[[list[str] | None], int]) -> Callable[..., int
                     which = signals.name_of(heard[0]) if heard else "SIGINT"
         finally:
             if getattr(signal.getsignal(signal.SIGINT), "__module__", "") == "bridge":  # that of a command's start
-                signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is over: nothing is left to be stopped
+                signal.signal(signal.SIGINT, signal.SIG_DFL)  # it is over, and its words would be false
         name = getattr(main.__globals__.get("__spec__"), "name", "bridge")
         print(f"{name}: stopped ({which})", file=sys.stderr)
         return Exit.STOPPED
@@ -138,6 +138,8 @@ def said(error: BaseException) -> str:
     """Return what went wrong with a file or an option in one line, without the number of the system's error."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}. Choose another place"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return " ".join(str(error).split())
 
 

@@ -10,6 +10,8 @@ import math
 import os
 import re
 import sys
+import time
+from collections import deque
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -44,8 +46,8 @@ DRIVE_NAME = "bridge_drive"
 GUARD_NAME = "bridge_guard"
 RECORD_NAME = "bridge_record"
 MANOEUVRE_NAME = "bridge_manoeuvre"
-INVALID = 10
-"""Rounds without a pause in which an entity of ROS is no longer valid, after which that is an error."""
+INVALID = 10, 10.0
+"""How often an entity of ROS may be invalid within a time [s]: as many as that are an error."""
 ENDLESS = 10**18
 """Nanoseconds from which a deadline or a lease is none: DDS has 2^63 - 1 for it."""
 PROFILE = Path(__file__).parents[1] / "fastdds.xml"
@@ -327,18 +329,19 @@ def node_session(name: str, arguments: list[str], realtime: int = 0, managed: bo
 def _join(name: str, arguments: list[str], managed: bool) -> Any:
     """Start ROS and return the node; arguments and errors as of `node_session`."""
     use_dds_profile()
+    command = name.replace("_", ".", 1)
     try:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
         from rclpy.utilities import remove_ros_args
     except ImportError as error:
-        raise SystemExit(f"{name}: {error}. The nodes need ROS 2 (Humble or newer) for Python. "
+        raise SystemExit(f"{command}: {error}. The nodes need ROS 2 (Humble or newer) for Python. "
                          "Source your ROS installation, or run `pip install -e '.[ros]'` on x86-64.") from error
     words = [sys.argv[0], *arguments]
     try:
         remove_ros_args(words)
     except RuntimeError as error:
-        print(f"{name}: {' '.join(arguments)}: ROS does not understand it: {_plain(error)}. Correct it.",
+        print(f"{command}: {' '.join(arguments)}: ROS does not understand it: {_plain(error)}. Correct it.",
               file=sys.stderr)
         raise SystemExit(int(Exit.REFUSED)) from None
     try:
@@ -347,7 +350,7 @@ def _join(name: str, arguments: list[str], managed: bool) -> Any:
         return managed_node(name) if managed else rclpy.create_node(name, start_parameter_services=False)
     except Exception as error:  # of rclpy, which has many kinds
         rclpy.try_shutdown()
-        raise SystemExit(f"{name}: ROS does not start: {_plain(error)}. Correct what follows --ros-args, or the "
+        raise SystemExit(f"{command}: ROS does not start: {_plain(error)}. Correct what follows --ros-args, or the "
                          "environment variable that it names (ROS_DOMAIN_ID, ROS_LOG_DIR, HOME).") from None
 
 
@@ -416,16 +419,14 @@ def _server(executor: Any) -> Callable[[float], None]:
     """
     from rclpy.impl.implementation_singleton import rclpy_implementation
 
-    again = 0
+    times: deque[float] = deque(maxlen=INVALID[0])
 
     def serve(seconds: float) -> None:
-        nonlocal again
         try:
             executor.spin_once(timeout_sec=seconds)
-            again = 0
         except rclpy_implementation.InvalidHandle:
-            again += 1
-            if again > INVALID:
+            times.append(time.monotonic())
+            if len(times) == INVALID[0] and times[-1] - times[0] < INVALID[1]:
                 raise
 
     return serve

@@ -40,8 +40,11 @@ def _placed(simulator: str) -> Iterator[None]:
     except Exception as error:
         if simulator == SIMULATOR:
             raise
-        places = [f"{one.filename}, line {one.lineno}: " for one in traceback.extract_tb(error.__traceback__)
+        own = getattr(sys.modules.get(simulator.partition(":")[0]), "__file__", None)
+        frames = [one for one in traceback.extract_tb(error.__traceback__)
                   if one.filename != __file__ and not one.filename.startswith("<")]
+        frames = [one for one in frames if one.filename == own] or frames  # rather than a place in a library
+        places = [f"{one.filename}, line {one.lineno}: " for one in frames]
         raise OptionError(f"--simulator {simulator}: {places[-1] if places else ''}{type(error).__name__}: {error}. It "
                           "must be MODULE:FACTORY, called with task and vehicle, and give what SimulatedVehicle says. "
                           "Correct it.") from error
@@ -54,12 +57,18 @@ def make_vehicle(options: argparse.Namespace) -> SimulatedVehicle:
         ValueError, FileNotFoundError: an option, or the policy's folder, is refused.
     """
     module, _, name = options.simulator.partition(":")
+    rule = "It must be MODULE:FACTORY, called with task and vehicle. Correct it or leave it out."
+    if not (module and name):
+        raise OptionError(f"--simulator {options.simulator}: {rule}")
     with _placed(options.simulator):
         try:
-            factory = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise OptionError(f"--simulator {options.simulator}: {error}. It must be MODULE:FACTORY, called with task "
-                              "and vehicle. Correct it or leave it out.") from error
+            factory = getattr(importlib.import_module(module), name, None)
+        except ModuleNotFoundError as error:
+            if not f"{module}.".startswith(f"{error.name}."):
+                raise  # one that the module itself imports
+            raise OptionError(f"--simulator {options.simulator}: {error}. {rule}") from error
+    if factory is None:
+        raise OptionError(f"--simulator {options.simulator}: the module has no {name}. {rule}")
     changes = dict(options.set)
     if options.policy is None:
         given = {"task": options.task or "corridor", "vehicle": options.vehicle, **changes}

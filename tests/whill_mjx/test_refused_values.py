@@ -71,6 +71,19 @@ def test_constant_rewards_and_those_of_a_moment_are_the_tasks_own():
     check_task(task_of(lambda moment: {"time": jnp.asarray(-0.05), "far": 1.0 / moment.goal_distance}))
 
 
+def test_the_check_of_constant_rewards_computes_no_others():
+    called = []
+
+    def measured(time):
+        called.append(time)
+        return np.float32(1.0)
+
+    check_task(task_of(lambda moment: {
+        "time": jnp.asarray(-0.05),
+        "other": jax.pure_callback(measured, jax.ShapeDtypeStruct((), np.float32), moment.time_s)}))
+    assert not called
+
+
 @pytest.mark.parametrize(("options", "words", "said"), [
     (TrainOptions, ["--steps", "1e6"], "--steps 1e6: must be a whole number, in digits alone. Correct it."),
     (TrainOptions, ["--seed", "1.0"], "--seed 1.0: must be a whole number"),

@@ -184,8 +184,13 @@ def _check_constants(task: Task, moment: Any, terms: Mapping[str, Any]) -> None:
             or out not in varying]
     if not same:
         return
+
+    def constants(moment: Any) -> list[Any]:
+        terms = task.rewards(moment)
+        return [terms[name] for name in same]
+
     with jax.ensure_compile_time_eval(), jax.debug_nans(False):
-        values = [task.rewards(_zeros(moment))[name] for name in same]
+        values = jax.jit(constants)(_zeros(moment))  # an argument: what depends on it is left out of the program
     for name, value in zip(same, jax.device_get(values), strict=True):
         if not np.isfinite(value):
             raise _wrong(task, "rewards", f"{name!r} is always {value}", "a finite number")

@@ -177,13 +177,25 @@ class Members(NamedTuple):
     used: jax.Array  # (strips,) int32: how many those are
 
 
-def strip_members(boxes: Bounds, view: View, strips: int) -> Members:
-    """The primitives of each strip, in the order of their numbers. The last strip may reach beyond the image."""
-    shown = _in_strips(boxes, view, strips)
+def strip_members(view: View, body: Body, mask: jax.Array, strips: int) -> Members:
+    """Bodies (P,) of each strip, in the order of their numbers. The last strip may reach beyond the image."""
+    shown = _in_strips(bounds(Eye(view.position, view.rotation), body, mask), view, strips)
+    shown |= mask & _around(view.position, body)
     number = jnp.broadcast_to(jnp.arange(shown.shape[1]), shown.shape)
     place = jnp.where(shown, jnp.cumsum(shown, 1) - 1, shown.shape[1])
     order = jnp.zeros(shown.shape, jnp.int32).at[jnp.arange(strips)[:, None], place].set(number, mode="drop")
     return Members(order, jnp.sum(shown, 1))
+
+
+def _around(position: jax.Array, body: Body) -> jax.Array:
+    """(P,) whether a place is within bodies, or so near that their rectangles, cut off at `NEAREST`, may miss them."""
+    away = [position[axis] - body.centre[axis] for axis in range(3)]
+    inside = jnp.ones(away[0].shape, bool)
+    for way in body.ways:
+        square = sum(part * part for part in way)
+        along = sum(part * far for part, far in zip(way, away, strict=True))
+        inside &= jnp.abs(along) <= square + 10.0 * NEAREST * jnp.sqrt(square)
+    return inside
 
 
 def _in_strips(boxes: Bounds, view: View, strips: int) -> jax.Array:

@@ -21,10 +21,9 @@ from whill_mjx.world.render import visibility
 from whill_mjx.world.render.blocks import IMAGES, in_blocks
 from whill_mjx.world.render.camera import Intrinsics
 from whill_mjx.world.render.culling import (
-    Eye,
+    Body,
     Members,
     block_body,
-    bounds,
     round_body,
     strip_lists,
     strip_members,
@@ -40,9 +39,9 @@ from whill_mjx.world.scene import Scene
 UNROLL = 8
 """Boxes tested in one loop round."""
 MANY = 24
-"""Primitives from which a processor lists those that each strip of an image can show; else each pixel meets all."""
+"""Primitives, with unused ones and the marker, from which a processor lists what each strip of an image can show."""
 STRIPS, AT_ONCE = 16, 2
-"""Those upright strips, and how many primitives of a list are tested in one round of a loop."""
+"""Upright strips at most, and how many primitives of a list are tested in one round of a loop."""
 PLAIN = Quality()
 
 
@@ -147,30 +146,31 @@ def _words(view: View, finite: jax.Array, stage: Arrays, quality: Quality) -> ja
     def some_rows(rows: jax.Array, column: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
         return drawn(stage, rows[:, None], column, view, finite)
 
-    few = stage.parts.labels - MARKER < MANY
-    if platform() != "cpu" or few or stage.lists is not None:
+    few, distorts = stage.parts.labels - MARKER < MANY, view.intrinsics.distortion is not None
+    if platform() != "cpu" or few or distorts or stage.lists is not None:
         return in_blocks(some_rows)(rows[:, 0], columns, view, finite, stage)
-    size = -(-view.intrinsics.width // STRIPS)
+    width = view.intrinsics.width
+    size = -(-width // STRIPS)
+    strips = -(-width // size)
 
     def some_strips(numbers: jax.Array, row: jax.Array, view: View, finite: jax.Array, stage: Arrays) -> jax.Array:
         members = jax.tree.map(lambda leaf: leaf[numbers], stage.members)
         column = numbers[:, None, None] * float(size) + jnp.arange(float(size))[:, None]
         return drawn(dataclasses.replace(stage, members=members), row, column, view, finite)
 
-    stage = dataclasses.replace(stage, members=_members(view, stage.parts))
-    words = in_blocks(some_strips, 1)(jnp.arange(STRIPS), rows[:, 0], view, finite, stage)
-    return words.reshape(STRIPS * size, -1)[: view.intrinsics.width].T
+    stage = dataclasses.replace(stage, members=_members(view, stage.parts, strips))
+    words = in_blocks(some_strips, 1)(jnp.arange(strips), rows[:, 0], view, finite, stage)
+    return words.reshape(strips * size, -1)[:width].T
 
 
-def _members(view: View, parts: Parts) -> dict[str, Members]:
+def _members(view: View, parts: Parts, strips: int) -> dict[str, Members]:
     """Of each kind of primitives, those that each strip can show."""
-    eye, boxes, blocks, rounds = Eye(view.position, view.rotation), parts.boxes, parts.blocks, parts.rounds
-    found = {"upright": bounds(eye, upright_body(boxes), boxes.mask)}
-    if blocks is not None:
-        found["block"] = bounds(eye, block_body(blocks), blocks.mask)
-    if rounds is not None:
-        found["round"] = bounds(eye, round_body(rounds), rounds.mask)
-    return {kind: strip_members(one, view, STRIPS) for kind, one in found.items()}
+    found: dict[str, tuple[Body, jax.Array]] = {"upright": (upright_body(parts.boxes), parts.boxes.mask)}
+    if parts.blocks is not None:
+        found["block"] = block_body(parts.blocks), parts.blocks.mask
+    if parts.rounds is not None:
+        found["round"] = round_body(parts.rounds), parts.rounds.mask
+    return {kind: strip_members(view, body, mask, strips) for kind, (body, mask) in found.items()}
 
 
 def _grid(intrinsics: Intrinsics) -> tuple[jax.Array, jax.Array]:
