@@ -2,30 +2,13 @@
 
 from __future__ import annotations
 
-import ast
+from functools import partial
 from pathlib import Path
 
-from whill_mjx.io.command_line import guarded, refuse_words
+from whill_mjx.io import command_list
 
 COMMANDS = ("inspect", "convert", "fit", "close_loop", "design", "paper", "searches", "report", "verdict")
-
-
-def first_line(name: str) -> str:
-    """The first line of a command's docstring, without what follows a colon."""
-    here = Path(__file__).parent
-    file = here / f"{name}.py"
-    source = (file if file.exists() else here / name / "__main__.py").read_text(encoding="utf-8")
-    return (ast.get_docstring(ast.parse(source)) or "").splitlines()[0].split(": `")[0].rstrip(".")
-
-
-def main() -> None:
-    """Print the list; refuse words."""
-    refuse_words("sysid", COMMANDS)
-    for name in COMMANDS:
-        print(f"python -m sysid.{name:<12} {first_line(name)}")
-    print("Each has --help.")
-
+first_line = partial(command_list.first_line, Path(__file__).parent)
 
 if __name__ == "__main__":
-    with guarded():
-        main()
+    command_list.list_commands(Path(__file__).parent, COMMANDS, 12)

@@ -202,15 +202,6 @@ def run(
         main(chosen)
 
 
-def refuse_words(package: str, commands: Sequence[str]) -> None:
-    """OptionError where words follow `python -m PACKAGE`, which lists its commands: they would do nothing."""
-    for word in sys.argv[1:]:
-        if word not in ("-h", "--help"):
-            known = word.removeprefix(f"{package}.").replace("-", "_")
-            remedy = f"Type python -m {package}.{known}" if known in commands else "Leave it out for the list"
-            raise OptionError(f"python -m {package}: {word}: takes no words. {remedy}.")
-
-
 @contextmanager
 def guarded(stopped: str = STOPPED) -> Iterator[None]:
     """End the process with one line and its exit code where the block goes wrong, or a signal comes.
