@@ -613,6 +613,20 @@ def test_a_clock_that_was_set_back_is_refused_and_rows_out_of_order_are_not(tmp_
     check(log.trials[0], pose=False)
 
 
+@pytest.mark.parametrize(("turn", "per_s"), [(2**16, 1e3), (2**32, 1e6), (2**32 / 1e6, 1.0)])
+def test_a_clock_that_overflows_is_counted_on(tmp_path, turn, per_s):
+    c = columns()
+    ticks = c["t"] * per_s
+    ticks = np.mod(ticks - ticks[200] + turn, turn)
+    log, notes = convert(ConvertConfig(write(tmp_path / "drive.csv", clocked(c, ticks)), tmp_path / "log"))
+    check(log.trials[0], pose=False)
+    assert log.trials[0].duration == pytest.approx(c["t"][-1] - c["t"][0], abs=0.01)
+    assert any(f"time counts to {turn:.7g} and begins anew: it is counted on" in note for note in notes)
+    ticks[300:] = np.mod(ticks[300:] - 2 * per_s, turn)  # and was set back by 2 s
+    with pytest.raises(ValueError, match="goes back"):
+        convert(ConvertConfig(write(tmp_path / "back.csv", clocked(c, ticks)), tmp_path / "again"))
+
+
 @pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%Y-%m-%dT%H:%M:%S.%f+02:00", "%H:%M:%S.%f",
                                   "%M:%S.%f", "%d.%m.%Y %H:%M:%S.%f", "%m/%d/%Y %I:%M:%S.%f %p",
                                   "%Y/%m/%d/%H:%M:%S.%f"])

@@ -87,8 +87,7 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     behind it, what the simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen
     in four paints.
     "transfer" is that budget in furnished rooms with other materials, light, film and vehicle in each episode, and with
-    twice as many paints of each drive, for a policy that drives where nobody trained. Its world model reconstructs
-    patterns that decide nothing, so pixels weigh a tenth, and what the simulator knows five times as much.
+    twice as many paints of each drive, for a policy that drives where nobody trained.
     "wallclock" spends environment steps to save time: thousands of instances, few updates per step. "cpu" is for 2
     cores: a decision every 0.5 s, a small network on 8x8 patches; tasks may make themselves easier for it. "smoke" only
     shows that everything runs.
@@ -114,8 +113,7 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     preset = _preset(name, chosen, budget)
     learner = _changed(preset.learner, budget.learner, f"task {chosen.name!r}: budget {name!r}")
     if name == "transfer":  # rooms differ more than the paper's looks do
-        learner = dataclasses.replace(learner, mirror=2 * learner.mirror + 1, recon_scale=0.1 * learner.recon_scale,
-                                      vector_scale=50.0 * learner.vector_scale)
+        learner = dataclasses.replace(learner, mirror=2 * learner.mirror + 1)
     if name in ("paper", "transfer"):  # the falling rate spans the run
         updates = int(budget.steps * learner.train_ratio) // learner.replayed_per_update
         learner = dataclasses.replace(learner, lr_decay=max(learner.warmup + 1, updates))

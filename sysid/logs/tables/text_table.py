@@ -28,6 +28,8 @@ ONE_SIDE = 0.5  # of the squares of qx and qy of a vehicle that lies on its side
 NUMBERED = re.compile(r"(\d+(?:(?:[\s,]+|\s*\.\.\s*)\d+)*)[\s:.)]+([^\W\d].*)")
 """A comment that gives columns names by their numbers, as loggers for MATLAB write it."""
 PREAMBLE = 30  # lines above the names
+OVERFLOWS = (2.0**16, 2.0**16 / 1e3, 2.0**32, 2.0**32 / 1e3, 2.0**32 / 1e6, 2.0**32 / 1e9)
+"""Where counters of 16 and 32 bits begin anew; also those of ms, us and ns that are written in seconds."""
 HOUR = 3600.0  # s
 DAY = 86400.0  # s
 DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})[ T/,-]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)?"
@@ -109,12 +111,42 @@ def _table(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]], lin
             continue
         if name in numbers and not np.array_equal(numbers[name], values, equal_nan=True):
             raise ValueError(f"{path}: two columns are named {shown(name)} and differ. Give each its own name.")
+        if (turn := overflow_of(values)) is not None:
+            values = without_overflows(values, turn)
+            odd[name] = f"{name} counts to {turn:.7g} and begins anew: it is counted on"
         numbers[name] = values
         wrong = [int(k) for k in np.flatnonzero(~known) if cells[k].lower() not in MISSING]
         if wrong:
-            odd[name] = (f"{counted(len(wrong), 'cell')} of {name} {'is no number' if len(wrong) == 1 else 'are none'} "
-                         f"({shown(cells[wrong[0]])} in line {lines[wrong[0]]}): left out")
+            left = (f"{counted(len(wrong), 'cell')} of {name} {'is no number' if len(wrong) == 1 else 'are none'} "
+                    f"({shown(cells[wrong[0]])} in line {lines[wrong[0]]}): left out")
+            odd[name] = "; ".join([odd[name], left] if name in odd else [left])
     return Table(path.stem, _with_whole_stamps(numbers), odd, texts)
+
+
+def overflow_of(values: np.ndarray) -> float | None:
+    """Where a counter (T,) that only goes forward overflows, as a microcontroller's clock of 16 or 32 bits does.
+
+    Each step back must be one step forward as the others are, once the overflow is added. None where it goes back
+    otherwise, as a clock that was set back does, or never.
+    """
+    known = values[np.isfinite(values)]
+    steps = np.diff(known)
+    back, ahead = steps[steps < 0], steps[steps > 0]
+    if not len(back) or len(back) > len(ahead) / 2 or known.min() < 0:
+        return None
+    for turn in OVERFLOWS:
+        over = back + turn
+        if known.max() < turn and ahead.min() / 2 <= over.min() and over.max() <= 2 * ahead.max() < turn / 2:
+            return turn
+    return None
+
+
+def without_overflows(values: np.ndarray, turn: float) -> np.ndarray:
+    """The counter (T,) that goes on instead of beginning anew; nan where it was."""
+    known = np.isfinite(values)
+    counted_on = values.copy()
+    counted_on[known] += turn * np.cumsum(np.diff(values[known], prepend=values[known][:1]) < 0)
+    return counted_on
 
 
 def _texts(folder: Path) -> list[Path]:
