@@ -622,6 +622,9 @@ def test_a_clock_that_overflows_is_counted_on(tmp_path, turn, per_s):
     check(log.trials[0], pose=False)
     assert log.trials[0].duration == pytest.approx(c["t"][-1] - c["t"][0], abs=0.01)
     assert any(f"time counts to {turn:.7g} and begins anew: it is counted on" in note for note in notes)
+    doubled = (tmp_path / "drive.csv").read_text().splitlines()  # two columns of one name that agree are one
+    (tmp_path / "twice.csv").write_text("\n".join(f"{line},{line.partition(',')[0]}" for line in doubled))
+    assert "time" in read_table(tmp_path / "twice.csv").columns
     ticks[300:] = np.mod(ticks[300:] - 2 * per_s, turn)  # and was set back by 2 s
     with pytest.raises(ValueError, match="goes back"):
         convert(ConvertConfig(write(tmp_path / "back.csv", clocked(c, ticks)), tmp_path / "again"))

@@ -109,11 +109,11 @@ def _table(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]], lin
         if known.sum() < 3 or not name:
             texts |= {name: cells[0]} if name and any(cells) else {}
             continue
-        if name in numbers and not np.array_equal(numbers[name], values, equal_nan=True):
-            raise ValueError(f"{path}: two columns are named {shown(name)} and differ. Give each its own name.")
         if (turn := overflow_of(values)) is not None:
             values = without_overflows(values, turn)
             odd[name] = f"{name} counts to {turn:.7g} and begins anew: it is counted on"
+        if name in numbers and not np.array_equal(numbers[name], values, equal_nan=True):
+            raise ValueError(f"{path}: two columns are named {shown(name)} and differ. Give each its own name.")
         numbers[name] = values
         wrong = [int(k) for k in np.flatnonzero(~known) if cells[k].lower() not in MISSING]
         if wrong:
