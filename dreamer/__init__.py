@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dreamer.training.checkpoint import CheckpointError as CheckpointError
     from dreamer.types import FunctionalEnv as FunctionalEnv
     from dreamer.types import Mirror as Mirror
+    from dreamer.types import Redraw as Redraw
     from dreamer.types import Transition as Transition
 
 _HOMES = {
@@ -30,6 +31,7 @@ _HOMES = {
     "FunctionalEnv": "dreamer.types",
     "Transition": "dreamer.types",
     "Mirror": "dreamer.types",
+    "Redraw": "dreamer.types",
     "Box": "dreamer.spaces",
     "Discrete": "dreamer.spaces",
     "from_gym": "dreamer.gym",

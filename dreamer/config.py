@@ -124,6 +124,10 @@ class DreamerConfig:
     """How many times more to remember every step, as the environment's mirror shows it in this many other worlds. Steps
     and ratio count the real ones."""
 
+    redraw: bool = False
+    """Hold in the replay what observations are drawn from, and draw them anew for each update (`dreamer.types.Redraw`):
+    no picture is learned twice."""
+
     horizon: float = 333.0
     """Effective horizon [steps]; discount 1 - 1/horizon, contained in the continue head."""
     imag_horizon: int = 15

@@ -51,6 +51,17 @@ class Mirror:
 
 
 @dataclass(frozen=True, eq=False)
+class Redraw:
+    """Observations drawn anew each time the replay is read: the same moment in other colours, light and noise."""
+
+    keep: Callable[[EnvState, Any], Any]
+    """The environment's state and the observations (N, ...) of its last step -> what the replay holds of them, arrays
+    (N, ...)."""
+    draw: Callable[[Any, jax.Array], Any]
+    """What is held of one step, and a random key -> its observation. All steps of a sequence get the same key."""
+
+
+@dataclass(frozen=True, eq=False)
 class FunctionalEnv:
     """A vector environment as two pure functions. Compared by identity, so it can be static."""
 
@@ -66,6 +77,8 @@ class FunctionalEnv:
     """state, action -> state and next frames; actions are (N, A) in [-1, 1], or classes (N,) int32."""
     mirror: Mirror | None = None
     """A symmetry that `DreamerConfig.mirror` learns from; None: there is none."""
+    redraw: Redraw | None = None
+    """How `DreamerConfig.redraw` draws observations anew; None: it cannot."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for instances, observations, actions or functions of another kind."""

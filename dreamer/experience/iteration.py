@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from dreamer import spaces
 from dreamer.config import LEAST_TRAIN_RATIO, DreamerConfig
-from dreamer.experience import exploration, replay
+from dreamer.experience import exploration, redraw, replay
 from dreamer.experience.host_replay import HostFrames
 from dreamer.experience.replay import Batch, Replay
 from dreamer.layers import sensors
@@ -77,6 +77,7 @@ def check_fit(env: FunctionalEnv, config: DreamerConfig, total_steps: int = 0) -
             f"DreamerConfig.mirror = {int(config.mirror)}, but the environment has no mirror that shows more than "
             f"{worlds} other worlds: lower it, or give one."
         )
+    redraw.check(env, config)
     sensors.check(config, env.obs_shape)
     replay.rows_for(config, env.num_envs)
     credit_rates(config, env.num_envs)
@@ -105,7 +106,8 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
         transition=transition,
         carry=agents.init_carry(config, env.num_envs * (1 + config.mirror), env.action_dim),
         replay=replay.init(
-            config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width, 1 + config.mirror
+            config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width, 1 + config.mirror,
+            redraw.kept(env, config, env_state, transition),
         ),
         key=key,
         env_steps=zero,
@@ -170,6 +172,10 @@ def collect(
         others = env.mirror.action(real, config.mirror)
         action = jnp.concatenate([real, others.reshape(-1, *real.shape[1:])])
     latent = Latent(carry["deter"], carry["stoch"])
+    kept = redraw.kept(env, config, state.env_state, state.transition)
+    if kept is not None:
+        kept = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.mirror)), kept)
+        frame = dataclasses.replace(frame, obs=kept)
     memory = replay.write(config, state.replay, frame, action, latent)
     env_state, transition = env.advance(state.env_state, actions.to_env(real))
     check_same("the Transition: ", state.transition, transition)
@@ -224,7 +230,8 @@ def learn(
     ready = started(config, state) & enough
     credit = state.credit + jnp.where(ready, gain, 0)
     updates = credit // price
-    state, metrics = replayed_updates(config, state, updates, key, agents.update, mesh)
+    update = redraw.on_redrawn(env, config, agents.update)
+    state, metrics = replayed_updates(config, state, updates, key, update, mesh)
     return dataclasses.replace(state, credit=credit - updates * price), metrics
 
 

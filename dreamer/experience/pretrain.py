@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from dreamer.config import DreamerConfig
+from dreamer.experience import redraw
 from dreamer.experience.iteration import Metrics, TrainState, collect, replayed_updates, sum_over
 from dreamer.model import agent as agents
 from dreamer.types import FunctionalEnv
@@ -39,7 +40,8 @@ def pretrain_iteration(
     updates = jnp.where(missing > 0, 0, left)
     state, driven = sum_over(steps, partial(_drive, env, config, drive_key), dataclasses.replace(state, key=key))
     plain = dataclasses.replace(config, lr_decay=0)  # the decay belongs to the counted updates
-    state, learned = replayed_updates(plain, state, updates, update_key, agents.update_model, mesh)
+    update = redraw.on_redrawn(env, config, agents.update_model)
+    state, learned = replayed_updates(plain, state, updates, update_key, update, mesh)
     assert state.pretrained is not None
     done = dataclasses.replace(state.pretrained, updates=state.pretrained.updates + updates)
     over = done.updates >= config.pretrain_updates

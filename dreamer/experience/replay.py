@@ -33,7 +33,8 @@ class Replay:
     """The memory, with L rows."""
 
     obs: Any
-    """(L, N, H, W, C) uint8 images, (L, N, D) float32 vectors, as the environment names them; or `HostFrames`."""
+    """(L, N, H, W, C) uint8 images, (L, N, D) float32 vectors, as the environment names them; or `HostFrames`; or what
+    `dreamer.types.Redraw` keeps of them."""
     reward: jax.Array
     """(L, N) float32."""
     is_first: jax.Array
@@ -68,6 +69,8 @@ class Batch:
     is_terminal: jax.Array
     start: Latent
     """(B, ...) stored state of the step before the first."""
+    stream: jax.Array | None = None
+    """(B,) int32 column of the memory."""
 
 
 @struct.dataclass
@@ -96,12 +99,22 @@ def rows_for(config: DreamerConfig, num_envs: int) -> int:
     return rows
 
 
-def init(config: DreamerConfig, num_envs: int, obs_shape: ObsShape, action_width: int, copies: int = 1) -> Replay:
-    """An empty memory for actions of this many numbers, with `copies` streams for each instance."""
+def init(
+    config: DreamerConfig, num_envs: int, obs_shape: ObsShape, action_width: int, copies: int = 1, kept: Any = None
+) -> Replay:
+    """An empty memory for actions of this many numbers, with `copies` streams for each instance.
+
+    It holds observations; or what is `kept` in their place, of which these are the arrays (N, ...) or their shapes.
+    """
     shape = (rows_for(config, num_envs), copies * num_envs)
-    on_host = config.replay_memory == "host"
+    if kept is not None:
+        obs = jax.tree.map(lambda leaf: jnp.zeros((*shape, *leaf.shape[1:]), leaf.dtype), kept)
+    elif config.replay_memory == "host":
+        obs = host_replay.init(obs_shape, shape)
+    else:
+        obs = spaces.zeros(obs_shape, shape)
     return Replay(
-        obs=host_replay.init(obs_shape, shape) if on_host else spaces.zeros(obs_shape, shape),
+        obs=obs,
         reward=jnp.zeros(shape, jnp.float32),
         is_first=jnp.zeros(shape, bool),
         is_last=jnp.zeros(shape, bool),
@@ -215,6 +228,7 @@ def gather(config: DreamerConfig, replay: Replay, window: Window) -> tuple[Repla
         is_last=take(replay.is_last, trained),
         is_terminal=take(replay.is_terminal, trained),
         start=start,
+        stream=parallel.deal(window.stream, mine, 0),
     )
     return replay, batch
 

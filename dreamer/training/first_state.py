@@ -81,7 +81,7 @@ def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["
             "DreamerConfig.replay_memory = 'host': a replay in the host's memory belongs to one seed on one device. "
             "Give one seed and no devices, or leave it at 'auto' with a smaller replay_capacity."
         )
-    if config.replay_memory != "auto" or not alone:
+    if config.replay_memory != "auto" or not alone or config.redraw:
         return "host" if config.replay_memory == "host" else "device"
     if fits(env, config):
         return "device"

@@ -14,7 +14,7 @@ from flax import struct
 from dreamer.config import DreamerConfig, preset
 from dreamer.spaces import Discrete
 from dreamer.train import TrainingOptions, train
-from dreamer.types import FunctionalEnv, Transition
+from dreamer.types import FunctionalEnv, Redraw, Transition
 
 SHAPE = (16, 16, 3)
 
@@ -86,6 +86,19 @@ def corridor_env(num_envs: int, length: int = 4, limit: int = 12) -> FunctionalE
         return ToyState(state.key, place, count, transition.is_last), transition
 
     return FunctionalEnv(num_envs, SHAPE, 1, reset, step)
+
+
+def with_redraw(env: FunctionalEnv) -> FunctionalEnv:
+    """The environment, whose images in the replay are redrawn: dark or light as they were, in a shade by the key."""
+
+    def keep(state: Any, obs: jax.Array) -> jax.Array:
+        return obs[:, 0, 0, 0] / 255.0
+
+    def draw(level: jax.Array, key: jax.Array) -> jax.Array:
+        tone = jax.random.randint(key, (), 0, 128)
+        return jnp.full(SHAPE, jnp.where(level > 0.5, 128, 0) + tone, jnp.uint8)
+
+    return dataclasses.replace(env, redraw=Redraw(keep, draw))
 
 
 def echo_env(num_envs: int) -> FunctionalEnv:

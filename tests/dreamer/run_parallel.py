@@ -8,19 +8,22 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-from dreamer_toys import corridor_env, tiny_config  # noqa: E402
+from dreamer_toys import corridor_env, tiny_config, with_redraw  # noqa: E402
 
-from dreamer.experience import iteration  # noqa: E402
+from dreamer.experience import iteration, redraw  # noqa: E402
 from dreamer.layers import sensors  # noqa: E402
 from dreamer.train import TrainingOptions, train  # noqa: E402
 from dreamer.training import parallel  # noqa: E402
 from dreamer.training.first_state import first_state  # noqa: E402
 from dreamer.training.programs import Place  # noqa: E402
+from dreamer.types import Mirror  # noqa: E402
 
 # Learning starts with the last iteration: two updates. Later ones amplify rounding, since the outer bins of a young
 # two-hot critic are near 5e8, so that runs agree in what they learn but not in every digit.
@@ -70,11 +73,27 @@ def redundancy(mesh):
     return np.concatenate([np.ravel(value), np.ravel(gradient), np.ravel(drawn)])
 
 
+def drawn_anew(mesh):
+    """Redrawn images (4, 16, ...) of steps that are dark and light in turn, every second one of a mirrored stream."""
+    mirror = Mirror(lambda state, obs, worlds: 255 - obs[None], lambda action, worlds: -action[None])
+    env = dataclasses.replace(with_redraw(ENV), mirror=mirror)
+    config = dataclasses.replace(CONFIG, redraw=True, mirror=1)
+    levels = jnp.arange(64.0).reshape(4, 16) % 3 / 2
+
+    def share(levels, stream):
+        batch = SimpleNamespace(reward=levels, obs=levels, stream=stream)
+        return redraw.drawn(env, config, batch, jax.random.PRNGKey(4))
+
+    return jax.jit(parallel.over_batch(mesh, share, (1, 0), 1))(levels, jnp.arange(16) % 2 * env.num_envs)
+
+
 def several_devices(out):
     alone, alone_sums, before = run(jax.devices()[:1])
     many, many_sums, placed = run(jax.devices())
     mesh = parallel.make_mesh(jax.devices(), 8, 16)
-    np.savez(out, alone=alone, many=many, statistics_alone=redundancy(None), statistics_many=redundancy(mesh))
+    kept = {"statistics_alone": redundancy(None), "statistics_many": redundancy(mesh),
+            "drawn_alone": drawn_anew(None), "drawn_many": drawn_anew(mesh)}  # fmt: skip
+    np.savez(out, alone=alone, many=many, **kept)
     told = {"alone": alone_sums, "many": many_sums, "flops_alone": before["flops"], **placed}
     out.with_suffix(".json").write_text(json.dumps(told))
 

@@ -58,6 +58,12 @@ def test_what_the_whole_batch_tells_is_that_of_one_device(several):
     np.testing.assert_allclose(result["statistics_many"], result["statistics_alone"], rtol=1e-5, atol=1e-6)
 
 
+def test_each_of_eight_devices_draws_its_own_sequences_anew(several):
+    result, _ = several
+    np.testing.assert_array_equal(result["drawn_many"], result["drawn_alone"])
+    assert len(np.unique(result["drawn_alone"][:, :, 0, 0, 0] % 128)) > 8
+
+
 @pytest.mark.long
 def test_two_processes_train_save_and_restore_like_one(several, tmp_path):
     with socket.socket() as free:

@@ -13,7 +13,7 @@ from whill_mjx.tasks.tasks import make_task, sample_world
 from whill_mjx.world.eye import develop, plain_eye
 from whill_mjx.world.paint import paint
 from whill_mjx.world.render import camera_rotation, pinhole, render
-from whill_mjx.world.render.pallas import Tiling, fast_whole, render_pallas
+from whill_mjx.world.render.pallas import Tiling, fast_floor, fast_whole, render_pallas
 from whill_mjx.world.render.rich import NUMBERS, Surface, _paint
 from whill_mjx.world.render.textures import whole
 from whill_mjx.world.rich import PASSAGE, furnish, roles_of
@@ -91,12 +91,12 @@ def test_the_cells_of_a_material_are_the_same_where_a_gpu_rounds_down_by_a_sum()
     label = jnp.asarray(rng.integers(0, 30, 500))
     surface = Surface(rows, [jnp.float32(value) for value in numbers], label, place, jnp.float32(0.01))
 
-    def paint_by(whole):
+    def paint_by(floor, whole):
         small = lambda integer: integer.astype(jnp.float32)  # noqa: E731
-        stage = SimpleNamespace(whole=whole, small=small, ratio=lambda x, y: x / y)
+        stage = SimpleNamespace(floor=floor, whole=whole, small=small, ratio=lambda x, y: x / y)
         return _paint(stage, surface, jnp.uint32(7))
 
-    (exact, tones), (fast, other) = paint_by(whole), paint_by(fast_whole)
+    (exact, tones), (fast, other) = paint_by(jnp.floor, whole), paint_by(fast_floor, fast_whole)
     np.testing.assert_array_equal(exact, fast)
     np.testing.assert_array_equal(tones, other)
     assert np.std(tones) > 0.05

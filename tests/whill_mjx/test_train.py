@@ -410,14 +410,18 @@ def test_the_presets_have_the_papers_limits_and_split_over_devices(task):
 @pytest.mark.parametrize("name, task, layout, looks, worlds", [
     ("paper", "corridor", "randomised", None, 3), ("paper", "corridor", "fixed", None, 1),
     ("paper", "obstacle_course", "randomised", None, 1), ("paper", "corridor", "randomised", "plain", 1),
-    ("transfer", "corridor", "randomised", None, 7), ("transfer", "corridor", "randomised", "plain", 1),
+    ("transfer", "corridor", "randomised", None, 1), ("transfer", "corridor", "randomised", "plain", 1),
     ("transfer", "obstacle_course", "randomised", "plain", 1), ("paper", "corridor", "fixed", "rich", 3),
+    ("transfer", "obstacle_course", "randomised", None, 3),
 ])  # fmt: skip
 def test_the_mirror_shows_no_more_worlds_than_there_are(name, task, layout, looks, worlds):
     options = TrainOptions(preset=name, task=task, layout=layout, looks=looks)
     preset = choose_preset(options)
     batch = make_evaluation_env(preset.task, "whill_cr_ramp", 1, preset.looks)
     assert preset.learner.mirror == worlds <= functional_env(batch).mirror.worlds
+    drawn_anew = name == "transfer" and task == "corridor" and looks is None
+    assert preset.learner.redraw == drawn_anew and preset.learner.recon_scale == (0.1 if name == "transfer" and
+                                                                                  task == "corridor" else 1.0)
     assert preset.task.layout == layout and preset.looks == (looks or ("rich" if name == "transfer" else None))
 
 
@@ -425,6 +429,7 @@ def test_the_mirror_shows_no_more_worlds_than_there_are(name, task, layout, look
 @pytest.mark.parametrize("options, said", [
     (TrainOptions(preset="paper", task="corridor", looks="plain", change=("mirror=3",)), "mirror = 3.* than 1 other"),
     (TrainOptions(preset="smoke", task="corridor", looks="rich", change=("mirror=16",)), "mirror = 16.* than 15 other"),
+    (TrainOptions(preset="transfer", task="corridor", looks="plain", change=("redraw=true",)), "cannot be drawn anew"),
     (TrainOptions(preset="smoke", task="corridor", change=('decode_only=["odour"]',)), "shows no odour"),
     (TrainOptions(preset="smoke", change=("pretrain_steps=20", "pretrain_updates=2")), "pretrain_steps = 20"),
     (TrainOptions(preset="smoke", learner="ppo", change=("minibatches=7",)), "do not split into 7 minibatches"),

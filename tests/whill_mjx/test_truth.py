@@ -196,6 +196,38 @@ def test_where_looks_are_random_each_other_world_has_its_own_for_a_whole_episode
         np.testing.assert_array_equal(getattr(other.scene.boxes, name), getattr(one.env.scene.boxes, name))
 
 
+@pytest.mark.parametrize("looks", ["paper", pytest.param("rich", marks=pytest.mark.long)])
+def test_what_is_kept_of_a_moment_shows_it_again_in_other_looks(looks):
+    env, params = make_env("corridor", "whill_cr_ramp", height=16, width=16, looks=looks)
+    batch = make_batch(env, params, 2, spread=0.1)
+    learned = functional_env(batch, targets=True, redraw=True)
+    state, frame = jax.jit(learned.begin)(jax.random.PRNGKey(2))
+    for _ in range(3):
+        state, frame = jax.jit(learned.advance)(state, jnp.array([[1.0, 0.3], [0.5, -1.0]]))
+    held = learned.redraw.keep(state, frame.obs)
+    size = sum(leaf[0].size * leaf.dtype.itemsize for leaf in jax.tree.leaves(held))
+    assert size < 64 * 64 * 3 / 4  # bytes of what a learner's image would take
+    keys = jax.random.split(jax.random.PRNGKey(3), 2)
+    again = jax.jit(jax.vmap(learned.redraw.draw))(held, keys)
+    whole = jax.jit(jax.vmap(lambda one, key: observe(env, repainted(env, one, key))))(state.env, keys)
+    np.testing.assert_array_equal(again["camera"], whole)
+    np.testing.assert_array_equal(again[TRUTH], frame.obs[TRUTH])
+    other = jax.jit(jax.vmap(learned.redraw.draw))(held, keys[::-1])["camera"]
+    assert np.abs(np.asarray(other, int) - whole).mean((1, 2, 3)).min() > 10
+    assert learned.mirror.worlds == 1
+    flipped = learned.mirror.obs(None, again, 1)
+    np.testing.assert_array_equal(flipped["camera"][0], np.asarray(again["camera"])[:, :, ::-1])
+
+
+@pytest.mark.quick
+def test_what_always_looks_the_same_and_what_sensors_observe_is_not_drawn_anew():
+    assert functional_env(make_batch(ENV, PARAMS, 1), redraw=True).redraw is None
+    env = dataclasses.replace(ENV, rich=True)
+    assert functional_env(make_batch(env, PARAMS, 1), redraw=True).redraw is not None
+    env = dataclasses.replace(env, sensors=(("camera", Camera()),))
+    assert functional_env(make_batch(env, PARAMS, 1), redraw=True).redraw is None
+
+
 def test_the_targets_stand_beside_the_camera_and_are_no_input():
     batch = make_batch(ENV, PARAMS, 2)
     env, plain = functional_env(batch, targets=True), functional_env(batch)

@@ -123,6 +123,14 @@ def repainted(env: Env, state: State, key: jax.Array) -> State:
     return dataclasses.replace(state, scene=scene, photometry=photometry, key=key)
 
 
+def unpainted(state: State) -> State:
+    """The state without what `repainted` draws and without what no image shows: less to keep, to look at it again."""
+    scene = dataclasses.replace(state.scene, rich=None)
+    vehicle = dataclasses.replace(state.vehicle, memory=(), encoder=None, odometry=None, diverged=None)
+    unseen = dict.fromkeys(("command", "goal_distance", "episode_return", "done", "key"))
+    return dataclasses.replace(state, scene=scene, vehicle=vehicle, sensors=(), **unseen)
+
+
 def step_state(env: Env, params: VehicleParams, state: State, action: jax.Array) -> tuple[State, Outcome]:
     """State and outcome after one environment step, without the image."""
     command, unreadable = scale_action(env.task, action), ~jnp.isfinite(action).all()

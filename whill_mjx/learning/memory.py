@@ -43,7 +43,7 @@ def least_memory(preset: Preset, learner: str, observed: int) -> dict[str, float
     sequences = float(config.batch_size) * config.batch_length
     imagined = float(config.batch_size) * config.start_steps * config.imag_horizon
     return {f"instances ({preset.instances})": instances,
-            f"replay_capacity ({config.replay_capacity})": kept * observed,
+            f"replay_capacity ({config.replay_capacity})": kept * (HALF * config.deter if config.redraw else observed),
             f"batch_size ({config.batch_size}) x batch_length ({config.batch_length})":
                 sequences * (observed + HALF * config.deter),
             f"imag_horizon ({config.imag_horizon}) from all states of a batch": imagined * HALF * config.deter,

@@ -18,9 +18,9 @@ from dreamer.config import DreamerConfig
 from dreamer.config import preset as learner_preset
 from dreamer.experience.iteration import check_fit
 from dreamer.model import agent as agents
-from dreamer.types import FunctionalEnv, Mirror, Transition
+from dreamer.types import FunctionalEnv, Mirror, Redraw, Transition
 from whill_mjx.batch import BatchEnv, make_batch
-from whill_mjx.env import POSE_METRICS, Env, State, make_env
+from whill_mjx.env import POSE_METRICS, Env, State, make_env, unpainted
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.policies.novelty import watched
 from whill_mjx.learning import ppo
@@ -86,8 +86,9 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     many sequences of half the length make a batch, in less time. In the corridor, whose box may look like the floor
     behind it, what the simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen
     in four paints.
-    "transfer" is that budget in furnished rooms with other materials, light, film and vehicle in each episode, and with
-    twice as many paints of each drive, for a policy that drives where nobody trained.
+    "transfer" is for a policy that drives where nobody trained: furnished rooms with other materials, light, film and
+    vehicle in each episode. In the corridor each update draws its images anew; a task without a budget of its own for
+    it takes that of "paper", with twice as many paints of each drive.
     "wallclock" spends environment steps to save time: thousands of instances, few updates per step. "cpu" is for 2
     cores: a decision every 0.5 s, a small network on 8x8 patches; tasks may make themselves easier for it. "smoke" only
     shows that everything runs.
@@ -112,7 +113,7 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     chosen = _changed(chosen, budget.fields, f"task {chosen.name!r}: budget {name!r}")
     preset = _preset(name, chosen, budget)
     learner = _changed(preset.learner, budget.learner, f"task {chosen.name!r}: budget {name!r}")
-    if name == "transfer":  # rooms differ more than the paper's looks do
+    if name == "transfer" and name not in chosen.budgets:  # rooms differ more than the paper's looks do
         learner = dataclasses.replace(learner, mirror=2 * learner.mirror + 1)
     if name in ("paper", "transfer"):  # the falling rate spans the run
         updates = int(budget.steps * learner.train_ratio) // learner.replayed_per_update
@@ -184,12 +185,13 @@ def _changed(holder: Any, changes: Mapping[str, Any], where: str) -> Any:
 def with_layout(preset: Preset, layout: str, looks: str | None = None, vehicle: str | Path | None = None) -> Preset:
     """The same training of a vehicle in worlds of this layout and these looks; None keeps the preset's looks.
 
-    The mirror shows no more other worlds than there are.
+    The mirror shows no more other worlds than there are, and what always looks the same is not drawn anew.
     """
     task = dataclasses.replace(preset.task, layout=layout)  # an unknown one is refused here
     looks = preset.looks if looks is None else looks
-    worlds = min(preset.learner.mirror, mirror_worlds(make_env(task, vehicle, looks=looks)[0]))
-    learner = dataclasses.replace(preset.learner, mirror=worlds)
+    env = make_env(task, vehicle, looks=looks)[0]
+    worlds, redraw = min(preset.learner.mirror, mirror_worlds(env)), preset.learner.redraw and can_redraw(env)
+    learner = dataclasses.replace(preset.learner, mirror=worlds, redraw=redraw)
     return dataclasses.replace(preset, task=task, looks=looks, learner=learner)
 
 
@@ -270,7 +272,7 @@ def to_transition(step: TimeStep, people: People | None) -> Transition:
 
 
 def functional_env(
-    batch: BatchEnv, safety: Safety | None = None, shaped: bool = True, targets: bool = False
+    batch: BatchEnv, safety: Safety | None = None, shaped: bool = True, targets: bool = False, redraw: bool = False
 ) -> FunctionalEnv:
     """The learner's view of a batch of chairs, with left and right as its mirror.
 
@@ -279,6 +281,7 @@ def functional_env(
         safety: limits the commands and, if `shaped`, takes its penalties off the reward; None asks nothing.
         shaped: False leaves the reward the task's own, as evaluations must.
         targets: show what only the simulator knows too, as TRUTH beside "camera"; it is no input of a policy.
+        redraw: images can be drawn anew, in other looks; the mirror then shows the images that it is given.
 
     Raises:
         ValueError: a collision monitor is asked for, and nothing scans.
@@ -320,9 +323,9 @@ def functional_env(
         return state, emit(state, step)
 
     shape = with_truth(obs_shape_of(batch.env)) if targets else obs_shape_of(batch.env)
-    return FunctionalEnv(
-        num_envs=batch.count, obs_shape=shape, action_dim=2, reset=reset, step=step, mirror=mirror_of(batch)
-    )
+    again = redraw_of(batch) if redraw else None
+    mirror = mirror_of(batch, paints=again is None)
+    return FunctionalEnv(batch.count, shape, 2, reset, step, mirror, again)
 
 
 def with_truth(shape: Any) -> dict[str, tuple[int, ...]]:
@@ -349,7 +352,29 @@ def obs_shape_of(env: Env) -> Any:
     return shapes
 
 
-def mirror_of(batch: BatchEnv) -> Mirror | None:
+def redraw_of(batch: BatchEnv) -> Redraw | None:
+    """How a batch's images are drawn anew in other looks; None where they always look the same, or sensors observe."""
+    if not can_redraw(batch.env):
+        return None
+
+    def keep(state: Any, obs: Any) -> Any:
+        instances = state[0] if isinstance(state, tuple) else state  # a collision monitor's memory is beside it
+        return unpainted(instances.env), obs.get(TRUTH) if isinstance(obs, dict) else None
+
+    def draw(kept: Any, key: jax.Array) -> Any:
+        moment, known = kept
+        image = batch.observe_anew(moment, key)
+        return image if known is None else {"camera": image, TRUTH: known}
+
+    return Redraw(keep, draw)
+
+
+def can_redraw(env: Env) -> bool:
+    """Whether the images of an environment can be drawn anew in other looks."""
+    return env.repaints and not env.sensors
+
+
+def mirror_of(batch: BatchEnv, paints: bool = True) -> Mirror | None:
     """Left and right exchanged. A vehicle that pulls to one side breaks the symmetry by as much as it pulls.
 
     Where looks are drawn at random, each of its worlds has its own, every second one with left and right as they are:
@@ -366,7 +391,7 @@ def mirror_of(batch: BatchEnv) -> Mirror | None:
             lambda state, obs, worlds: {name: mirrors[name](value)[None] for name, value in obs.items()},
             lambda action, worlds: (action * jnp.array([1.0, -1.0]))[None],
         )
-    paints = batch.env.repaints
+    paints, most = (batch.env.repaints, most) if paints else (False, 1)
 
     def turned(plain: jax.Array, mirrored: jax.Array) -> jax.Array:
         """Every second of the worlds (K, ...) as it is."""
@@ -404,7 +429,8 @@ def mirror_worlds(env: Env) -> int:
 
 def check_learner(preset: Preset, learner: str, batch: BatchEnv) -> None:
     """Raise ValueError where a preset's learner, "dreamer" or "ppo", does not suit what it would train on."""
-    env = functional_env(batch, preset.safety, targets=learner == "dreamer" and TRUTH in preset.learner.decode_only)
+    redraw, known = preset.learner.redraw, learner == "dreamer" and TRUTH in preset.learner.decode_only
+    env = functional_env(batch, preset.safety, targets=known, redraw=redraw)
     if learner == "dreamer":
         check_fit(env, preset.learner, preset.total_steps)
     else:

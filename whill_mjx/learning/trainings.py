@@ -57,7 +57,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
     evaluate = evaluation_of(held_out, preset, options.seed, kept)
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
-        functional_env(batch, preset.safety, targets=TRUTH in preset.learner.decode_only),
+        functional_env(batch, preset.safety, True, TRUTH in preset.learner.decode_only, preset.learner.redraw),
         preset.learner,
         options.out,
         stopper.total_steps(preset.total_steps),

@@ -254,6 +254,9 @@ class Arrays(Everywhere):
         floor = larger(smaller(jnp.floor(x), np.float32(2.0**22 - 1.0)), np.float32(-(2.0**22)))
         return jax.lax.bitcast_convert_type(floor + np.float32(1.5 * 2.0**23), jnp.int32) - np.int32(0x4B400000)
 
+    def floor(self, x) -> jax.Array:
+        return jnp.floor(x)
+
     def small(self, integer) -> jax.Array:
         return integer.astype(jnp.int32).astype(jnp.float32)
 

@@ -23,7 +23,7 @@ from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
 from whill_mjx.world.render.rectangles import CHUNK, Kind, Listed, Numbers, listed
 from whill_mjx.world.render.rich import CASTER, NUMBERS, caster_factor, caster_reach
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
-from whill_mjx.world.render.tables import lit_words, make_tables, parts_of
+from whill_mjx.world.render.tables import lit_words, make_tables, parts_of, row_numbers
 from whill_mjx.world.render.textures import whole
 from whill_mjx.world.render.visibility import FAR, MARKER, Rays, key_of
 from whill_mjx.world.scene import Scene
@@ -71,7 +71,7 @@ class Inputs:
     integers: Any  # (2,) seed, and whether the pose is finite
     words: Any  # (labels * 4,)
     dark: Any
-    rows: Any  # lines of 18 numbers, as `_flat` lays them
+    rows: Any  # lines of `row_numbers`, as `_flat` lays them
     bent: Any  # of 8
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
@@ -161,6 +161,7 @@ def _static(scene: Scene, tiling: Tiling) -> dict[str, Any]:
         "fast": tiling.fast and not tiling.interpret,
         "interpret": tiling.interpret,
         "cull": tiling.cull,
+        "row_numbers": row_numbers(scene),
     }
 
 
@@ -297,8 +298,16 @@ def fast_whole(x):
     Conversions run at a quarter of the rate of a sum. Wrong for whole x, and only for compilers that keep the order of
     the sums, as Triton does.
     """
-    shifted = (x - 0.5) + np.float32(1.5 * 2.0**23)
-    return jax.lax.bitcast_convert_type(shifted, jnp.int32) - np.int32(0x4B400000)
+    return jax.lax.bitcast_convert_type(_shifted(x), jnp.int32) - np.int32(0x4B400000)
+
+
+def fast_floor(x):
+    """The same as float: for whole x it may be x - 1, as in `fast_whole`."""
+    return _shifted(x) - np.float32(1.5 * 2.0**23)
+
+
+def _shifted(x):
+    return (x - 0.5) + np.float32(1.5 * 2.0**23)
 
 
 def fast_small(integer):
@@ -325,6 +334,7 @@ class Refs:
     fast: bool
     interpret: bool
     cull: bool
+    row_numbers: int
 
     @property
     def picture(self) -> Any:
@@ -393,7 +403,7 @@ class Refs:
         return self.data.dark[code]
 
     def row(self, code) -> list:
-        return _line(self.data.rows, code, 18)
+        return _line(self.data.rows, code, self.row_numbers)
 
     def material(self, label) -> list:
         return _line(self.data.materials, label, NUMBERS)
@@ -411,6 +421,9 @@ class Refs:
 
     def whole(self, x) -> jax.Array:
         return fast_whole(x) if self.fast else whole(x)
+
+    def floor(self, x) -> jax.Array:
+        return fast_floor(x) if self.fast else jnp.floor(x)
 
     def small(self, integer) -> jax.Array:
         return fast_small(integer) if self.fast else integer.astype(jnp.float32)

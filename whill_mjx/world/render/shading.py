@@ -101,6 +101,9 @@ class Stage(Protocol):
     def whole(self, x) -> Any:
         """Largest integer not above x, as int32."""
 
+    def floor(self, x) -> Any:
+        """The same as float. Both may be one less where x is whole, but agree."""
+
     def small(self, integer) -> Any:
         """A uint32 below 2^23 as float."""
 

@@ -88,7 +88,7 @@ class Tables:
     words: jax.Array  # (labels, 4) uint32 colour of each face
     dark: jax.Array | None  # (labels, 4) uint32 colour of each face in shadow
     bent: jax.Array | None  # (K * 4, 8) geometry of each face of the rounds, whose words hold no light
-    rows: jax.Array | None  # (labels * 4, 18) geometry and texture of each face
+    rows: jax.Array | None  # (labels * 4, row_numbers) geometry and texture of each face
     upright_shadow: jax.Array | None  # (P, 11)
     block_shadow: jax.Array | None  # (K, 18)
     round_shadow: jax.Array | None  # (K, 13)
@@ -161,14 +161,19 @@ def face_words(position: jax.Array, parts: Parts, looks: Looks, lit: bool) -> tu
     return under(looks.diffuse), under(0.0)
 
 
+def row_numbers(scene: Scene) -> int:
+    """Numbers of a face in `face_rows`."""
+    return 16 if scene.finish is None else 18
+
+
 def face_rows(position: jax.Array, parts: Parts, scene: Scene) -> jax.Array:
-    """(labels * 4, 18) numbers of each face.
+    """(labels * 4, row_numbers) numbers of each face.
 
     0-2 normal, or the axis of a round; 3-5 centre, 6 half length and 7 inverse radius of a round, 0 for flat faces;
-    8-11 and 12-15 the maps from a point of the world to texture coordinates s and t; 16 texture; 17 repeats per metre.
+    8-11 and 12-15 the maps from a point of the world to texture coordinates s and t; with a
+    finish also 16 texture and 17 repeats per metre.
     """
     labels, finish = parts.labels, scene.finish
-    number = jnp.zeros(labels) if finish is None else finish.texture.astype(jnp.float32)
     scale = jnp.ones(labels) if finish is None else finish.scale
     ground = jnp.array([0, 0, 1.0, 0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0])
     ground = jnp.broadcast_to(ground, (1, 4, 16)).at[..., 8:].multiply(_inverse(scale[GROUND]))
@@ -184,9 +189,11 @@ def face_rows(position: jax.Array, parts: Parts, scene: Scene) -> jax.Array:
         rows.append(_box_rows(position, blocks.centre, blocks.half, blocks.rotation, own))
     if parts.rounds is not None:
         rows.append(_round_rows(position, parts.rounds, scale[parts.first_round :]))
-    extra = jnp.stack([number, jnp.where(scale > 0, _inverse(scale), 1.0)], 1)
-    table = jnp.concatenate([jnp.concatenate(rows), jnp.broadcast_to(extra[:, None], (labels, 4, 2))], 2)
-    return table.reshape(labels * 4, 18)
+    table = jnp.concatenate(rows)
+    if finish is not None:
+        extra = jnp.stack([finish.texture.astype(jnp.float32), jnp.where(scale > 0, _inverse(scale), 1.0)], 1)
+        table = jnp.concatenate([table, jnp.broadcast_to(extra[:, None], (labels, 4, 2))], 2)
+    return table.reshape(labels * 4, row_numbers(scene))
 
 
 def _box_rows(position, centre, half, rotation, scale) -> jax.Array:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 
 from whill_mjx.world.materials import ATLAS, TEXTURES
+from whill_mjx.world.render.visibility import bits_to_float
+
+ALONG, ACROSS, ABOVE = np.uint32(73856093), np.uint32(19349663), np.uint32(83492791)
+"""Multipliers of a cell's three numbers, before their bits are mixed."""
 
 
 def texture(number, s, t, fine, seed, picture=None) -> list:
@@ -64,29 +71,43 @@ def _line(x, width):
     return jnp.where(jnp.abs(x - 0.5) > 0.5 - width, 1.0, 0.0)
 
 
-def smooth_noise(x, y, seed):
-    """Random number in [0, 1) that varies smoothly from one lattice point to the next."""
-    column, row = jnp.floor(x), jnp.floor(y)
-    a, b = x - column, y - row
+def whole(x):
+    """Largest integer not above x, as int32."""
+    return jnp.floor(jnp.asarray(x)).astype(jnp.int32)
+
+
+class Rounding(NamedTuple):
+    """How numbers are rounded down: `floor` to a float, `whole` to int32. A GPU has faster ways."""
+
+    floor: Callable
+    whole: Callable
+
+
+EXACT = Rounding(jnp.floor, whole)
+
+
+def smooth_noise(x, y, seed, how: Any = EXACT):
+    """Random number in [0, 1) that varies smoothly from one lattice point to the next; `how` rounds down."""
+    a, b = x - how.floor(x), y - how.floor(y)
     a, b = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b)
-    low = _between(random_cell(column, row, 5.0, seed), random_cell(column + 1.0, row, 5.0, seed), a)
-    high = _between(random_cell(column, row + 1.0, 5.0, seed), random_cell(column + 1.0, row + 1.0, 5.0, seed), a)
-    return _between(low, high, b)
+    left, under, own = how.whole(x).astype(jnp.uint32) * ALONG, how.whole(y).astype(jnp.uint32) * ACROSS, 5 * ABOVE
+    right, over, own = left + ALONG, under + ACROSS, own ^ seed
+    low = _between(_random(left ^ under ^ own), _random(right ^ under ^ own), a)
+    return _between(low, _between(_random(left ^ over ^ own), _random(right ^ over ^ own), a), b)
 
 
 def _between(low, high, share):
     return low + share * (high - low)
 
 
-def whole(x):
-    """Largest integer not above x, as int32."""
-    return jnp.floor(jnp.asarray(x)).astype(jnp.int32)
-
-
 def random_cell(x, y, z, seed, whole=whole):
     """Random number in [0, 1) of the unit cell around a point; `seed` is uint32, `whole` rounds down to int32."""
     a, b, c = (whole(value).astype(jnp.uint32) for value in (x, y, z))
-    mixed = (a * np.uint32(73856093)) ^ (b * np.uint32(19349663)) ^ (c * np.uint32(83492791)) ^ seed
+    return _random((a * ALONG) ^ (b * ACROSS) ^ (c * ABOVE) ^ seed)
+
+
+def _random(mixed):
+    """Number in [0, 1) of a uint32: its mixed bits are the mantissa of a float in [1, 2), which no conversion slows."""
     mixed = (mixed ^ (mixed >> 15)) * np.uint32(0x9E3779B1)
     mixed = (mixed ^ (mixed >> 13)) * np.uint32(0x85EBCA6B)
-    return (mixed >> 8).astype(jnp.int32).astype(jnp.float32) * (1.0 / (1 << 24))
+    return bits_to_float((mixed >> 9).astype(jnp.int32) | np.int32(0x3F800000)) - 1.0
