@@ -329,7 +329,8 @@ CLAIMS = (
         "policy is surprised beyond its own limit. In rooms never seen three later trainings drove 71 to 75 times "
         "each, without the stop and with weights rounded to half precision. In the trainings before, the GPU drew "
         "neighbouring cells of a material in one tone, which is mended. The rank correlation is that of success here "
-        "and there, over 12 policies of the trainings before.",
+        "and there, over 12 policies of the trainings before. All of these trainings kept eight paints of each drive. "
+        "The preset now draws images anew; a note has [one training with it](notes/unseen_rooms.md).",
         ("what", "plain", "furnished", "never seen"),
         (
             ("arrived", "{foreign_plain|%}", "{foreign_furnished|%}", "{foreign_unseen|%}"),

@@ -126,8 +126,9 @@ def repainted(env: Env, state: State, key: jax.Array) -> State:
 def unpainted(state: State) -> State:
     """The state without what `repainted` draws and without what no image shows: less to keep, to look at it again."""
     scene = dataclasses.replace(state.scene, rich=None)
-    vehicle = dataclasses.replace(state.vehicle, memory=(), encoder=None, odometry=None, diverged=None)
-    unseen = dict.fromkeys(("command", "goal_distance", "episode_return", "done", "key"))
+    unmoved: dict[str, Any] = dict.fromkeys(("encoder", "odometry", "diverged"))
+    unseen: dict[str, Any] = dict.fromkeys(("command", "goal_distance", "episode_return", "done", "key"))
+    vehicle = dataclasses.replace(state.vehicle, memory=(), **unmoved)
     return dataclasses.replace(state, scene=scene, vehicle=vehicle, sensors=(), **unseen)
 
 
