@@ -100,6 +100,8 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
     zero = jnp.zeros((), jnp.int32)
     agent_key, env_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state, transition = env.begin(env_key)
+    held = redraw.kept(env, config, env_state, transition)
+    redraw.check_memory(env, config, held)
     return TrainState(
         agent=agents.init_agent(config, env.obs_shape, env.action_dim, agent_key),
         env_state=env_state,
@@ -107,7 +109,7 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
         carry=agents.init_carry(config, env.num_envs * (1 + config.mirror), env.action_dim),
         replay=replay.init(
             config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width, 1 + config.mirror,
-            redraw.kept(env, config, env_state, transition),
+            held,
         ),
         key=key,
         env_steps=zero,

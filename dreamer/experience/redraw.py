@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from dreamer.config import DreamerConfig
+from dreamer.experience import host_replay
 from dreamer.experience.replay import Batch
 from dreamer.training import parallel
 from dreamer.types import EnvState, FunctionalEnv, Transition
@@ -35,6 +36,18 @@ def kept(env: FunctionalEnv, config: DreamerConfig, env_state: EnvState, transit
         return None
     assert env.redraw is not None
     return env.redraw.keep(env_state, transition.obs)
+
+
+def check_memory(env: FunctionalEnv, config: DreamerConfig, held: Any) -> None:
+    """Raise ValueError where what is `held` of each step, (N, ...), would take more than half of the device's memory.
+
+    A map's walls are a part of what its images are drawn from.
+    """
+    each = sum(leaf.size // env.num_envs * leaf.dtype.itemsize for leaf in jax.tree.leaves(held))
+    needed = each * (1 + config.mirror) * config.replay_capacity // jax.device_count()
+    if needed and not host_replay.fits(needed, jax.devices()[0]):
+        raise ValueError(f"DreamerConfig.redraw holds {each:,} bytes of each step, {needed / 1e9:.1f} GB in all, which "
+                         "is more than half of the device's memory. Lower replay_capacity, or set redraw to false.")
 
 
 def on_redrawn(env: FunctionalEnv, config: DreamerConfig, update: Callable[..., Any]) -> Callable[..., Any]:

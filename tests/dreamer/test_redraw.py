@@ -73,3 +73,14 @@ def test_a_training_that_redraws_learns_goes_on_after_a_stop_and_repeats_itself(
 def test_what_cannot_be_redrawn_is_refused(env, changes, said):
     with pytest.raises(ValueError, match=said):
         iteration.check_fit(env, tiny_config(**changes))
+
+
+def test_what_would_fill_the_device_is_refused(monkeypatch):
+    env, config = with_redraw(corridor_env(2)), tiny_config(redraw=True)
+    asked = []
+    monkeypatch.setattr(redraw.host_replay, "fits", lambda size, device: asked.append(size) or False)
+    with pytest.raises(ValueError, match="4 bytes of each step.*Lower replay_capacity"):
+        iteration.init_state(env, config, 0)
+    assert asked == [4 * config.replay_capacity // jax.device_count()]
+    state = iteration.init_state(env, tiny_config(), 0)  # images are moved to the host instead, as before
+    assert state.replay.obs.dtype == jnp.uint8
