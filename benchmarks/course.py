@@ -111,7 +111,7 @@ def together(options: argparse.Namespace) -> None:
     rows = steps + 2 * preset.instances + learner.pretrain_steps
     learner = dataclasses.replace(learner, replay_capacity=min(learner.replay_capacity, rows))
     vehicle = options.vehicle or "whill_cr_ramp"
-    held_out = functional_env(make_evaluation_env(task, vehicle, preset.eval_episodes), shaped=False)
+    held_out = functional_env(make_evaluation_env(task, vehicle, preset.eval_episodes, preset.looks), shaped=False)
 
     def evaluation(params: Any, number: int, episodes: int) -> list[dict[str, float]]:
         found = evaluate(held_out, learner, params, jax.random.key(number), episodes)
@@ -125,9 +125,9 @@ def together(options: argparse.Namespace) -> None:
                 for name, value in one.items()}
 
     starts = preset.exploring_starts if options.starts is None else options.starts
-    plain = dataclasses.replace(preset, task=task, exploring_starts=starts, spread=0.0, looks=None, vary=())
+    plain = dataclasses.replace(preset, task=task, exploring_starts=starts, spread=0.0, vary=())
     training = make_training_env(plain, vehicle)
-    env = functional_env(training, targets=TRUTH in learner.decode_only)
+    env = functional_env(training, targets=TRUTH in learner.decode_only, redraw=learner.redraw)
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None
     options.out.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,8 @@ class Mirror:
     """What is seen and done in other worlds, mirrored ones say, where rewards and ends are the same."""
 
     obs: Callable[[EnvState, Any, int], Any]
-    """The environment's state, the observations (N, ...) of its last step, K -> those of K worlds (K, N, ...)."""
+    """The environment's state, the observations (N, ...) of its last step, K -> those of K worlds (K, N, ...). With
+    `DreamerConfig.redraw` there is no state any more: it gets None, redrawn observations, and K = 1."""
     action: Callable[[jax.Array, int], jax.Array]
     """Actions (N, A), one-hot where they are classes, and K -> those of the same K worlds (K, N, A)."""
     worlds: int = 1

@@ -71,13 +71,13 @@ def check_fit(env: FunctionalEnv, config: DreamerConfig, total_steps: int = 0) -
     """Raise ValueError where observation, mirror, replay, pretraining or the run's length do not fit; nothing is
     computed."""
     whole("total_steps", total_steps, 0, INT32 - env.num_envs * config.steps_per_iter)
+    redraw.check(env, config)
     worlds = 0 if env.mirror is None else env.mirror.worlds
     if config.mirror > worlds:
         raise ValueError(
             f"DreamerConfig.mirror = {int(config.mirror)}, but the environment has no mirror that shows more than "
             f"{worlds} other worlds: lower it, or give one."
         )
-    redraw.check(env, config)
     sensors.check(config, env.obs_shape)
     replay.rows_for(config, env.num_envs)
     credit_rates(config, env.num_envs)

@@ -22,10 +22,16 @@ from dreamer.types import EnvState, FunctionalEnv, Transition
 
 def check(env: FunctionalEnv, config: DreamerConfig) -> None:
     """Raise ValueError where the configuration asks for what the environment cannot draw."""
-    if config.redraw and env.redraw is None:
-        raise ValueError("DreamerConfig.redraw is true, but this environment's observations cannot be drawn anew: its "
-                         "images always look the same, or it has sensors. Set it to false.")
-    if config.redraw and config.replay_memory == "host":
+    if not config.redraw:
+        return
+    if env.redraw is None:
+        raise ValueError("DreamerConfig.redraw is true, but this environment's observations cannot be drawn anew: it "
+                         "has no FunctionalEnv.redraw (whill_mjx has one where looks are drawn at random, and no "
+                         "sensors observe). Give one, or set it to false.")
+    if config.mirror > 1:
+        raise ValueError(f"DreamerConfig.mirror = {config.mirror}: with redraw, every update sees other looks, and the "
+                         "mirror shows one other world. Set mirror to 1 or 0.")
+    if config.replay_memory == "host":
         raise ValueError("DreamerConfig.replay_memory = 'host': with redraw the replay holds no images, and stays on "
                          "the device. Leave it at 'auto'.")
 
@@ -41,11 +47,13 @@ def kept(env: FunctionalEnv, config: DreamerConfig, env_state: EnvState, transit
 def check_memory(env: FunctionalEnv, config: DreamerConfig, held: Any) -> None:
     """Raise ValueError where what is `held` of each step, (N, ...), would take more than half of the device's memory.
 
-    A map's walls are a part of what its images are drawn from.
+    A lower bound: it counts one seed, split over all devices. `replay_memory="device"` asks nothing.
     """
+    if held is None or config.replay_memory != "auto":
+        return
     each = sum(leaf.size // env.num_envs * leaf.dtype.itemsize for leaf in jax.tree.leaves(held))
     needed = each * (1 + config.mirror) * config.replay_capacity // jax.device_count()
-    if needed and not host_replay.fits(needed, jax.devices()[0]):
+    if not host_replay.fits(needed, jax.devices()[0]):
         raise ValueError(f"DreamerConfig.redraw holds {each:,} bytes of each step, {needed / 1e9:.1f} GB in all, which "
                          "is more than half of the device's memory. Lower replay_capacity, or set redraw to false.")
 

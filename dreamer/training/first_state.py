@@ -74,14 +74,16 @@ def _init(
     return functools.partial(jax.jit(lambda each: seeds.init_states(env, config, each)), np.asarray(seed, np.int32))
 
 
-def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["device", "host"]:
+def _memory(env: FunctionalEnv, config: DreamerConfig, alone: bool) -> Literal["auto", "device", "host"]:
     """Where the observations of the replay go; `alone`: one seed on one device."""
     if config.replay_memory == "host" and not alone:
         raise ValueError(
             "DreamerConfig.replay_memory = 'host': a replay in the host's memory belongs to one seed on one device. "
             "Give one seed and no devices, or leave it at 'auto' with a smaller replay_capacity."
         )
-    if config.replay_memory != "auto" or not alone or config.redraw:
+    if config.redraw:
+        return config.replay_memory  # auto: `init_state` sees how much is held
+    if config.replay_memory != "auto" or not alone:
         return "host" if config.replay_memory == "host" else "device"
     if fits(env, config):
         return "device"

@@ -67,7 +67,8 @@ def test_a_training_that_redraws_learns_goes_on_after_a_stop_and_repeats_itself(
 
 
 @pytest.mark.parametrize("env, changes, said", [
-    (corridor_env(2), dict(redraw=True), "cannot be drawn anew.*Set it to false"),
+    (corridor_env(2), dict(redraw=True), "cannot be drawn anew.*Give one, or set it to false"),
+    (with_redraw(corridor_env(2)), dict(redraw=True, mirror=2), "mirror = 2: with redraw.*Set mirror to 1"),
     (with_redraw(corridor_env(2)), dict(redraw=True, replay_memory="host"), "'host': with redraw.*Leave it at 'auto'"),
 ])  # fmt: skip
 def test_what_cannot_be_redrawn_is_refused(env, changes, said):
@@ -82,5 +83,5 @@ def test_what_would_fill_the_device_is_refused(monkeypatch):
     with pytest.raises(ValueError, match="4 bytes of each step.*Lower replay_capacity"):
         iteration.init_state(env, config, 0)
     assert asked == [4 * config.replay_capacity // jax.device_count()]
-    state = iteration.init_state(env, tiny_config(), 0)  # images are moved to the host instead, as before
-    assert state.replay.obs.dtype == jnp.uint8
+    by_hand = iteration.init_state(env, dataclasses.replace(config, replay_memory="device"), 0)
+    assert by_hand.replay.obs.dtype == jnp.float32 and len(asked) == 1

@@ -418,7 +418,8 @@ def test_the_mirror_shows_no_more_worlds_than_there_are(name, task, layout, look
     options = TrainOptions(preset=name, task=task, layout=layout, looks=looks)
     preset = choose_preset(options)
     batch = make_evaluation_env(preset.task, "whill_cr_ramp", 1, preset.looks)
-    assert preset.learner.mirror == worlds <= functional_env(batch).mirror.worlds
+    learned = functional_env(batch, redraw=preset.learner.redraw)
+    assert preset.learner.mirror == worlds <= learned.mirror.worlds
     drawn_anew = name == "transfer" and task == "corridor" and looks is None
     assert preset.learner.redraw == drawn_anew and preset.learner.recon_scale == (0.1 if name == "transfer" and
                                                                                   task == "corridor" else 1.0)
@@ -430,6 +431,7 @@ def test_the_mirror_shows_no_more_worlds_than_there_are(name, task, layout, look
     (TrainOptions(preset="paper", task="corridor", looks="plain", change=("mirror=3",)), "mirror = 3.* than 1 other"),
     (TrainOptions(preset="smoke", task="corridor", looks="rich", change=("mirror=16",)), "mirror = 16.* than 15 other"),
     (TrainOptions(preset="transfer", task="corridor", looks="plain", change=("redraw=true",)), "cannot be drawn anew"),
+    (TrainOptions(preset="paper", task="corridor", change=("redraw=true",)), "mirror = 3: with redraw.*to 1"),
     (TrainOptions(preset="smoke", task="corridor", change=('decode_only=["odour"]',)), "shows no odour"),
     (TrainOptions(preset="smoke", change=("pretrain_steps=20", "pretrain_updates=2")), "pretrain_steps = 20"),
     (TrainOptions(preset="smoke", learner="ppo", change=("minibatches=7",)), "do not split into 7 minibatches"),

@@ -30,7 +30,8 @@ def write_prediction(
     """
     periods = preset.task.action_repeat
     context, steps = max(2, SEEN // periods), max(8, (SEEN + FORETOLD) // periods)
-    env = functional_env(make_evaluation_env(preset.task, vehicle, drives), preset.safety, shaped=False)
+    seen_in = make_evaluation_env(preset.task, vehicle, drives, preset.looks)
+    env = functional_env(seen_in, preset.safety, shaped=False)
 
     @jax.jit
     def foretell(params: Params, key: jax.Array) -> tuple[jax.Array, jax.Array]:
