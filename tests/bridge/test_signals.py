@@ -15,8 +15,10 @@ pytestmark = pytest.mark.quick
 
 @pytest.fixture(autouse=True)
 def handlers():
-    """Those of a command that a user starts."""
+    """Those of a command that a user starts, without nohup, which has SIGHUP ignored."""
     before = {number: signal.getsignal(number) for number in signals.ENDING}
+    for number in signals.ENDING:
+        signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     for number, handler in before.items():
