@@ -134,10 +134,6 @@ class BatchEnv:
         every = jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))
         return jnp.swapaxes(self._split(lambda state: every(state, numbers))(state), 0, 1)
 
-    def observe_anew(self, kept: State, key: jax.Array) -> jax.Array:
-        """(H, W, 3) image of a moment that is `kept` (`env.unpainted`), in the other world that the key draws."""
-        return observe(self.env, repainted(self.env, kept, key))
-
     def _reset(self, keys: jax.Array) -> tuple[BatchState, TimeStep]:
         state, outcome = jax.vmap(self._begin)(keys)
         state, obs = self._sense(state)

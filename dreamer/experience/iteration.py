@@ -108,8 +108,7 @@ def init_state(env: FunctionalEnv, config: DreamerConfig, seed: int | jax.Array)
         transition=transition,
         carry=agents.init_carry(config, env.num_envs * (1 + config.mirror), env.action_dim),
         replay=replay.init(
-            config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width, 1 + config.mirror,
-            held,
+            config, env.num_envs, env.obs_shape, spaces.actions(env.action_dim).width, 1 + config.mirror, held
         ),
         key=key,
         env_steps=zero,
@@ -160,10 +159,10 @@ def collect(
     actions, noise, drawn = spaces.actions(env.action_dim), None, None
     if state.noise is not None:
         noise = exploration.advance(config, state.noise, random_key)
-        drawn = jnp.concatenate([noise] * (1 + config.mirror))  # the mirrored ones do not choose
+        drawn = repeated(noise, config.mirror)  # the mirrored ones do not choose
     greedy = exploration.greedy(config, env.num_envs)
     if greedy is not None:
-        greedy = jnp.concatenate([greedy] * (1 + config.mirror))
+        greedy = repeated(greedy, config.mirror)
     choice = agents.Choice(policy_key, drawn, greedy)
     carry, action = agents.act(config, state.agent.params, state.carry, frame.obs, frame.is_first, choice)
     random_action = actions.random(random_key, action.shape[:1]) if drawn is None else exploration.uniform(drawn)
@@ -176,8 +175,7 @@ def collect(
     latent = Latent(carry["deter"], carry["stoch"])
     kept = redraw.kept(env, config, state.env_state, state.transition)
     if kept is not None:
-        kept = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + config.mirror)), kept)
-        frame = dataclasses.replace(frame, obs=kept)
+        frame = dataclasses.replace(frame, obs=repeated(kept, config.mirror))
     memory = replay.write(config, state.replay, frame, action, latent)
     env_state, transition = env.advance(state.env_state, actions.to_env(real))
     check_same("the Transition: ", state.transition, transition)
@@ -215,8 +213,12 @@ def with_mirrored(env: FunctionalEnv, env_state: EnvState, transition: Transitio
     assert env.mirror is not None
     others = env.mirror.obs(env_state, transition.obs, worlds)
     obs = jax.tree.map(lambda a, b: jnp.concatenate([a, b.reshape(-1, *a.shape[1:])]), transition.obs, others)
-    same = jax.tree.map(lambda a: jnp.concatenate([a] * (1 + worlds)), dataclasses.replace(transition, obs=None))
-    return dataclasses.replace(same, obs=obs)
+    return dataclasses.replace(repeated(dataclasses.replace(transition, obs=None), worlds), obs=obs)
+
+
+def repeated(tree: Any, worlds: int) -> Any:
+    """What belongs to N instances, (N, ...), and after it the same for each of the other worlds."""
+    return jax.tree.map(lambda leaf: jnp.concatenate([leaf] * (1 + worlds)), tree)
 
 
 def learn(

@@ -20,7 +20,7 @@ from dreamer.experience.iteration import check_fit
 from dreamer.model import agent as agents
 from dreamer.types import FunctionalEnv, Mirror, Redraw, Transition
 from whill_mjx.batch import BatchEnv, make_batch
-from whill_mjx.env import POSE_METRICS, Env, State, make_env, unpainted
+from whill_mjx.env import POSE_METRICS, Env, State, make_env, observe, repainted, unpainted
 from whill_mjx.evaluation.drivers import Driver
 from whill_mjx.evaluation.policies.novelty import watched
 from whill_mjx.learning import ppo
@@ -363,7 +363,7 @@ def redraw_of(batch: BatchEnv) -> Redraw | None:
 
     def draw(kept: Any, key: jax.Array) -> Any:
         moment, known = kept
-        image = batch.observe_anew(moment, key)
+        image = observe(batch.env, repainted(batch.env, moment, key))
         return image if known is None else {"camera": image, TRUTH: known}
 
     return Redraw(keep, draw)
@@ -391,7 +391,7 @@ def mirror_of(batch: BatchEnv, paints: bool = True) -> Mirror | None:
             lambda state, obs, worlds: {name: mirrors[name](value)[None] for name, value in obs.items()},
             lambda action, worlds: (action * jnp.array([1.0, -1.0]))[None],
         )
-    paints, most = (batch.env.repaints, most) if paints else (False, 1)
+    paints = paints and batch.env.repaints
 
     def turned(plain: jax.Array, mirrored: jax.Array) -> jax.Array:
         """Every second of the worlds (K, ...) as it is."""
@@ -411,7 +411,7 @@ def mirror_of(batch: BatchEnv, paints: bool = True) -> Mirror | None:
         action = jnp.broadcast_to(action, (worlds, *action.shape))
         return turned(action, action * jnp.array([1.0, -1.0]))
 
-    return Mirror(other_obs, other_action, worlds=most)
+    return Mirror(other_obs, other_action, worlds=most if paints else 1)
 
 
 def mirror_worlds(env: Env) -> int:

@@ -170,8 +170,8 @@ def face_rows(position: jax.Array, parts: Parts, scene: Scene) -> jax.Array:
     """(labels * 4, row_numbers) numbers of each face.
 
     0-2 normal, or the axis of a round; 3-5 centre, 6 half length and 7 inverse radius of a round, 0 for flat faces;
-    8-11 and 12-15 the maps from a point of the world to texture coordinates s and t; with a
-    finish also 16 texture and 17 repeats per metre.
+    8-11 and 12-15 the maps from a point of the world to texture coordinates s and t. With a
+    finish also: 16 texture, 17 repeats per metre.
     """
     labels, finish = parts.labels, scene.finish
     scale = jnp.ones(labels) if finish is None else finish.scale
