@@ -16,7 +16,7 @@ from whill_mjx.world.render import camera_rotation, pinhole, render
 from whill_mjx.world.render.pallas import Tiling, fast_floor, fast_whole, render_pallas
 from whill_mjx.world.render.rich import NUMBERS, Surface, _paint
 from whill_mjx.world.render.textures import whole
-from whill_mjx.world.rich import PASSAGE, furnish, roles_of
+from whill_mjx.world.rich import FLOOR, MARKER, PASSAGE, furnish, roles_of
 
 SIZE = 16
 
@@ -82,10 +82,12 @@ def test_things_never_close_the_passage(task):
     assert seen > 100
 
 
-def test_the_cells_of_a_material_are_the_same_where_a_gpu_rounds_down_by_a_sum():
+@pytest.mark.parametrize("figure", [-1.0, 0.0, 0.5])
+def test_the_cells_of_a_material_are_the_same_where_a_gpu_rounds_down_by_a_sum(figure):
     """Eagerly: XLA would merge the sums."""
     rng = np.random.default_rng(0)
     numbers = rng.uniform(0.2, 3.0, NUMBERS).astype(np.float32)
+    numbers[16], numbers[26] = 0.2, figure
     place = [jnp.asarray(rng.uniform(-4, 4, 500), jnp.float32) for _ in range(3)]
     rows = [jnp.float32(value) for value in rng.uniform(-1, 1, 18)]
     label = jnp.asarray(rng.integers(0, 30, 500))
@@ -100,6 +102,41 @@ def test_the_cells_of_a_material_are_the_same_where_a_gpu_rounds_down_by_a_sum()
     np.testing.assert_array_equal(exact, fast)
     np.testing.assert_array_equal(tones, other)
     assert np.std(tones) > 0.05
+
+
+@pytest.mark.parametrize(("figure", "fill"), [(0.0, 0.4), (0.5, 0.05)])
+def test_figures_have_two_paints_and_the_shapes_of_blotches(figure, fill):
+    scene = paint(jax.random.key(1), furnished("corridor", jax.random.key(2)))
+    count = scene.rich.materials.fill.shape[0]
+    look_down = jnp.array([0.5, 0.0, 1.5]), camera_rotation(0.0, jnp.pi / 2)
+
+    def floor(figure, fill):
+        materials = dataclasses.replace(
+            scene.rich.materials, paint=jnp.tile(jnp.array([0.5, 0.1, 0.1]), (count, 1)),
+            second=jnp.tile(jnp.array([0.1, 0.5, 0.1]), (count, 1)), figure=jnp.full(count, figure),
+            fill=jnp.full(count, fill), blotch_size=jnp.full(count, 0.3), cell=jnp.full((count, 2), 0.3),
+        )  # fmt: skip
+        drawn = dataclasses.replace(scene, rich=dataclasses.replace(scene.rich, materials=materials))
+        image = np.asarray(render(*look_down, pinhole(0.5, SIZE, SIZE), drawn), int)
+        return image[..., 1] > image[..., 0]
+
+    green = floor(figure, fill)
+    assert 0.05 < green.mean() < 0.6
+    assert not floor(figure, 0.0).any() and floor(figure, 2.0).all()
+    assert (floor(figure, 1.5 * fill) >= green).all()
+    assert (floor(-1.0, 0.4) != green).any()  # where cells are filled instead
+
+
+def test_some_floors_are_figured_and_some_are_blue():
+    draw = jax.jit(jax.vmap(lambda key: paint(key, furnished("corridor", jax.random.key(2))).rich.materials))
+    drawn = draw(jax.random.split(jax.random.key(0), 2000))
+    ground = slice(1, 2)
+    assert 0.1 < np.mean(drawn.figure[:, ground] >= 0.0) < 0.25
+    assert 0.03 < np.mean(drawn.figure[:, ground] > 0.0) < 0.15
+    blue = lambda paint: paint[..., 2] > 2.0 * np.maximum(paint[..., 0], paint[..., 1]) + 0.05  # noqa: E731
+    roles = roles_of(furnished("corridor", jax.random.key(2)))
+    assert blue(drawn.paint[:, ground]).any() and blue(drawn.second[:, ground]).any()
+    assert not blue(drawn.paint[:, (roles != FLOOR) & (roles != MARKER)]).any()
 
 
 @pytest.mark.long

@@ -40,14 +40,14 @@ from whill_mjx.world.rich import (
 from whill_mjx.world.scene import Scene
 
 PROPERTIES = ("value", "saturation", "second", "cell_s", "cell_t", "shift", "joint", "joint_tone", "tone", "fill",
-              "blotch", "blotch_size", "grain", "grain_s", "grain_t", "gloss")  # fmt: skip
+              "blotch", "blotch_size", "grain", "grain_s", "grain_t", "gloss", "figure")  # fmt: skip
 _LOG = ("cell_s", "cell_t", "blotch_size", "grain_s", "grain_t", "value")
 """Properties whose logarithm is uniform."""
 PLAIN: dict[str, tuple[float, float]] = {
     "value": (0.3, 0.8), "saturation": (0.0, 0.15), "second": (0.7, 1.3), "cell_s": (1.0, 3.0), "cell_t": (1.0, 3.0),
     "shift": (0.0, 0.0), "joint": (0.0, 0.0), "joint_tone": (-0.2, 0.6), "tone": (0.0, 0.02), "fill": (0.0, 0.0),
     "blotch": (0.0, 0.12), "blotch_size": (0.2, 1.5), "grain": (0.0, 0.1), "grain_s": (0.01, 0.06),
-    "grain_t": (0.01, 0.06), "gloss": (0.0, 0.0),
+    "grain_t": (0.01, 0.06), "gloss": (0.0, 0.0), "figure": (-1.0, -1.0),
 }  # fmt: skip
 FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
     "plaster": {"value": (0.35, 0.85)},
@@ -75,6 +75,9 @@ FAMILIES: dict[str, dict[str, tuple[float, float]]] = {
               "fill": (0.1, 0.7), "second": (0.1, 3.0), "tone": (0.0, 0.5)},
     "stripes": {"value": (0.2, 0.8), "saturation": (0.0, 0.3), "cell_s": (0.03, 0.4), "cell_t": (20.0, 30.0),
                 "fill": (0.3, 0.6), "second": (0.6, 1.4), "tone": (0.0, 0.2)},
+    "figured": {"value": (0.06, 0.6), "saturation": (0.0, 1.0), "fill": (0.3, 0.55), "second": (0.15, 4.0),
+                "figure": (-0.7, 0.7), "blotch_size": (0.06, 0.5), "blotch": (0.0, 0.05), "grain": (0.0, 0.4),
+                "gloss": (0.0, 0.1)},
     "cardboard": {"value": (0.15, 0.45), "saturation": (0.35, 0.75), "cell_s": (0.08, 0.25), "cell_t": (0.06, 0.2),
                   "fill": (-0.2, 0.15), "second": (0.1, 2.5), "grain": (0.0, 0.15), "blotch": (0.0, 0.2)},
     "paint": {"value": (0.03, 0.85), "saturation": (0.0, 0.9), "gloss": (0.0, 0.05)},
@@ -88,9 +91,9 @@ BOLD_LIMITS = {"joint": (0.0, 0.03), "joint_tone": (-1.5, 0.95), "tone": (0.0, 0
 WARM = ("brick", "planks", "cardboard")
 """Families whose hue lies between red and yellow."""
 CHOICE: dict[int, tuple[str, ...]] = {
-    FLOOR: ("tiles", "planks", "carpet", "concrete", "linoleum", "plaster", "stones", "brick"),
+    FLOOR: ("tiles", "planks", "carpet", "concrete", "linoleum", "plaster", "stones", "brick", "figured", "figured"),
     MARKER: ("plaster",),
-    WALL: ("plaster", "plaster", "brick", "panels", "tiles", "concrete", "planks", "stripes"),
+    WALL: ("plaster", "plaster", "brick", "panels", "tiles", "concrete", "planks", "stripes", "figured"),
     OBSTACLE: ("cardboard", "cardboard", "cardboard", "cardboard", "paint", "print", "planks", "black"),
     THING: ("paint", "black", "metal", "planks", "print", "cardboard", "plaster", "paint"),
     PANEL: ("plaster", "plaster", "planks", "paint", "panels"),
@@ -98,11 +101,11 @@ CHOICE: dict[int, tuple[str, ...]] = {
     LAMP: ("plaster",),
     FRAME: ("paint", "metal", "planks", "plaster"),
     DOOR: ("planks", "paint", "plaster", "panels"),
-    POSTER: ("print", "print", "paint", "plaster"),
+    POSTER: ("print", "print", "paint", "figured"),
     WINDOW: ("plaster",),
     POLE: ("black", "metal", "plaster"),
     TOP: ("paint", "black", "planks", "metal", "print"),
-    PERSON: ("paint", "paint", "black", "stripes", "print", "carpet"),
+    PERSON: ("paint", "paint", "black", "stripes", "print", "figured"),
 }
 _NAMES = tuple(FAMILIES)
 _RANGES = np.array(
@@ -146,15 +149,13 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     value = dict(zip(PROPERTIES, jnp.where(_IS_LOG, scaled, level).T, strict=True))
     value = _bold(value, *jax.random.uniform(bold_key, (2,)))
     rest = u[:, 1 + len(PROPERTIES) :]
-    warm = jnp.isin(family, jnp.array([_NAMES.index(name) for name in WARM]))
-    odd = rest[:, 14] < 0.12  # a tail of saturated paints
-    saturation = jnp.where(odd, jnp.sqrt(value["saturation"]), value["saturation"])
-    base = _reflectance(value["value"], saturation, rest[:, 0], warm)
-    other = _reflectance(
-        jnp.clip(value["value"] * value["second"], 0.02, 0.9), value["saturation"] * rest[:, 1], rest[:, 2], warm
-    )
+    base, other = _two_paints(value, rest, family, roles)
+    figured = family == _NAMES.index("figured")
     square = (family == _NAMES.index("tiles")) & (rest[:, 3] < 0.7)
     cell = jnp.stack([value["cell_s"], jnp.where(square, value["cell_s"], value["cell_t"])], 1)
+    cell = jnp.where(figured[:, None], value["blotch_size"][:, None], cell)
+    level = jnp.where(figured, jnp.maximum(value["figure"], 0.0), -1.0)
+    fill = jnp.clip(value["fill"], 0.0, 1.0) * jnp.where(level > 0.0, 0.2, 1.0)  # rings are thin
 
     is_wall, is_carton = roles == WALL, roles == OBSTACLE
     # Walls have a skirting or a painted lower part, cartons a band of tape or print.
@@ -164,7 +165,8 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     none = jnp.full(labels, -1.0)
     top = jnp.where(is_wall, skirting, jnp.where(is_carton & (rest[:, 4] < 0.5), tape + 0.02 + 0.1 * rest[:, 6], none))
     foot = jnp.where(is_carton, tape, none)
-    band = _reflectance(0.03 + 0.8 * rest[:, 7] ** 2, 0.5 * rest[:, 8], rest[:, 9], jnp.zeros(labels, bool))
+    never = np.zeros(labels, bool)
+    band = _reflectance(0.03 + 0.8 * rest[:, 7] ** 2, 0.5 * rest[:, 8], rest[:, 9], never, never)
 
     blue = jnp.stack([0.01 + 0.06 * rest[:, 10], 0.02 + 0.14 * rest[:, 11], 0.35 + 0.5 * rest[:, 12]], 1)
     is_marker, is_lamp, is_window = roles == MARKER, roles == LAMP, roles == WINDOW
@@ -173,11 +175,24 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     calm = jnp.where(is_marker, 0.5, 1.0)
     return Materials(
         paint=base, second=other, band_paint=band, cell=cell, shift=value["shift"], joint=value["joint"],
-        joint_tone=value["joint_tone"], tone=value["tone"] * calm, fill=jnp.clip(value["fill"], 0.0, 1.0),
+        joint_tone=value["joint_tone"], tone=value["tone"] * calm, fill=fill, figure=level,
         blotch=value["blotch"] * calm, blotch_size=value["blotch_size"], grain=value["grain"] * calm,
         grain_size=jnp.stack([value["grain_s"], value["grain_t"]], 1), band=jnp.stack([foot, top], 1), glow=glow,
         gloss=value["gloss"],
     )  # fmt: skip
+
+
+def _two_paints(value: dict[str, jax.Array], rest: jax.Array, family: jax.Array, roles: np.ndarray) -> list[jax.Array]:
+    """(L, 3) reflectances of the ground of each material and of what is filled."""
+    warm = jnp.isin(family, jnp.array([_NAMES.index(name) for name in WARM]))
+    odd = rest[:, 14] < 0.12  # a tail of saturated paints
+    ground = jnp.where(odd, jnp.sqrt(value["saturation"]), value["saturation"])
+    figured = family == _NAMES.index("figured")
+    filled = jnp.where(figured, 1.0, value["saturation"]) * rest[:, 1]  # figures have a colour of their own
+    second = jnp.clip(value["value"] * value["second"], 0.02, 0.9)
+    blue = roles == FLOOR  # it may be as blue as the marker, which stands
+    paints = (value["value"], ground, rest[:, 0]), (second, filled, rest[:, 2])
+    return [_reflectance(*one, warm, blue) for one in paints]
 
 
 def _bold(value: dict[str, jax.Array], chance: jax.Array, size: jax.Array) -> dict[str, jax.Array]:
@@ -192,17 +207,17 @@ def _bold(value: dict[str, jax.Array], chance: jax.Array, size: jax.Array) -> di
     return {**value, **wider, "second": jnp.clip(second, 0.02, 10.0), "saturation": saturation}
 
 
-def _reflectance(value, saturation, hue, warm) -> jax.Array:
+def _reflectance(value, saturation, hue, warm, blue) -> jax.Array:
     """(L, 3) reflectance of a grey `value`, made more or less colourful; few are saturated.
 
-    Nothing but the marker is a saturated blue.
+    Where not `blue`, it is no saturated blue, as the marker is.
     """
     saturation = saturation * jnp.where(warm, 1.0, saturation)  # squares where any hue is allowed: a tail of odd ones
     turn = 2 * jnp.pi * jnp.where(warm, 0.02 + 0.12 * hue, hue)
     angles = jnp.stack([turn, turn - 2 * jnp.pi / 3, turn + 2 * jnp.pi / 3], 1)
     colour = jnp.clip(value[:, None] * (1.0 + saturation[:, None] * jnp.cos(angles)), 0.01, 0.95)
     most = jnp.maximum(colour[:, 0], colour[:, 1])
-    return colour.at[:, 2].set(jnp.minimum(colour[:, 2], 1.5 * most + 0.02))
+    return colour.at[:, 2].set(jnp.where(blue, colour[:, 2], jnp.minimum(colour[:, 2], 1.5 * most + 0.02)))
 
 
 def light_colour(kelvin) -> jax.Array:

@@ -33,17 +33,18 @@ PERSON = 14
 
 @struct.dataclass
 class Materials:
-    """Surfaces of L labels: joints of cells, tone by cell, blotches, grain, a band of other paint."""
+    """Surfaces of L labels: joints of cells, tone by cell, figures, blotches, grain, a band of other paint."""
 
     paint: jax.Array  # (L, 3) reflectance
-    second: jax.Array  # (L, 3) reflectance of the cells that are filled
+    second: jax.Array  # (L, 3) reflectance of what is filled
     band_paint: jax.Array  # (L, 3) reflectance of the band
     cell: jax.Array  # (L, 2) edges of a cell [m]
     shift: jax.Array  # (L,) by which each row of cells is moved [cells]
     joint: jax.Array  # (L,) width of the joint between cells [m]
     joint_tone: jax.Array  # (L,) relative darkness of the joint; negative is lighter
     tone: jax.Array  # (L,) relative brightness by cell
-    fill: jax.Array  # (L,) share of the cells that are filled
+    fill: jax.Array  # (L,) share of the cells that are filled; of figures, how far from their level
+    figure: jax.Array  # (L,) level of the blotches near which is filled: 0 spots, higher rings; negative fills cells
     blotch: jax.Array  # (L,) relative brightness of blotches
     blotch_size: jax.Array  # (L,) m
     grain: jax.Array  # (L,) relative brightness of the grain

@@ -1,7 +1,7 @@
 """Colour of what a ray meets in a world with rich looks: procedural materials, lamps, soft shadows, sunlight, gloss.
 
-One formula draws all materials: cells with joints, a tone by cell, blotches and grain. Which one it is, is numbers of
-its label, so that a pixel costs the same whatever it shows. Elementwise, shared by both renderers.
+One formula draws all materials: cells with joints, a tone by cell, figures, blotches and grain. Which one it is, is
+numbers of its label, so that a pixel costs the same whatever it shows. Elementwise, shared by both renderers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from whill_mjx.world.render.textures import random_cell, smooth_noise
 from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
 
-NUMBERS = 26
+NUMBERS = 27
 """Numbers of a material in the table."""
 CASTER = 10
 """Numbers of a thing that throws a soft shadow."""
@@ -33,7 +33,7 @@ def material_table(materials: Any) -> jax.Array:
         0.5 * materials.joint[:, None] * inverse, materials.joint_tone[:, None], materials.tone[:, None],
         materials.fill[:, None], materials.blotch[:, None], 1.0 / materials.blotch_size[:, None],
         materials.grain[:, None], 1.0 / materials.grain_size, materials.band, materials.glow[:, None],
-        materials.gloss[:, None],
+        materials.gloss[:, None], materials.figure[:, None],
     ]  # fmt: skip
     return jnp.concatenate(columns, 1)
 
@@ -96,7 +96,7 @@ def _paint(stage: Any, surface: Surface, seed: jax.Array) -> tuple[list, jax.Arr
     grains = jnp.maximum(m[20], m[21]) * pixel
     grain = (smooth_noise(s * m[20], t * m[21] + own, seed, stage) - 0.5) * stage.ratio(1.0, 1.0 + grains * grains)
     tone = (1.0 + 2.0 * m[15] * fine * (lot - 0.5)) * (1.0 + 2.0 * m[17] * blotch) * (1.0 + 2.0 * m[19] * grain)
-    filled = jnp.where(other < m[16], 1.0, 0.0)
+    filled = jnp.where(jnp.where(m[26] < 0.0, other, jnp.abs(blotch + (0.5 - m[26]))) < m[16], 1.0, 0.0)
     filled = m[16] + fine * (filled - m[16])
     banded = (z > m[22]) & (z < m[23])
     paint = []
