@@ -87,8 +87,8 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     behind it, what the simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen
     in four paints.
     "transfer" is for a policy that drives where nobody trained: furnished rooms with other materials, light, film and
-    vehicle in each episode. In the corridor each update draws its images anew, and learns from twice as many; a task
-    without a budget of its own for it takes that of "paper", with twice as many paints of each drive.
+    vehicle in each episode. In the corridor each update draws its images anew; a task without a budget of its own for
+    it takes that of "paper", with twice as many paints of each drive.
     "wallclock" spends environment steps to save time: thousands of instances, few updates per step. "cpu" is for 2
     cores: a decision every 0.5 s, a small network on 8x8 patches; tasks may make themselves easier for it. "smoke" only
     shows that everything runs.

@@ -31,7 +31,7 @@ class Corridor(Task):
         ),
         "transfer": Budget(  # no picture is learned twice, and most of what a picture shows is of no use elsewhere
             200_000, eval_every=20_000, second_tries=0.5,
-            learner=dict(batch_size=32, train_ratio=160.0, recon_scale=0.1, vector_scale=50.0, mirror=1, redraw=True),
+            learner=dict(train_ratio=160.0, recon_scale=0.1, vector_scale=50.0, mirror=1, redraw=True),
         ),
         "wallclock": Budget(8_000_000, eval_every=500_000, exploring_starts=0.5, stop_success=0.99),
         "cpu": Budget(8_000, eval_every=1000),
