@@ -149,8 +149,9 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     value = dict(zip(PROPERTIES, jnp.where(_IS_LOG, scaled, level).T, strict=True))
     value = _bold(value, *jax.random.uniform(bold_key, (2,)))
     rest = u[:, 1 + len(PROPERTIES) :]
-    base, other = _two_paints(value, rest, family, roles)
     figured = family == _NAMES.index("figured")
+    warm = jnp.isin(family, jnp.array([_NAMES.index(name) for name in WARM]))
+    base, other = _two_paints(value, rest, warm, figured, roles == FLOOR)
     square = (family == _NAMES.index("tiles")) & (rest[:, 3] < 0.7)
     cell = jnp.stack([value["cell_s"], jnp.where(square, value["cell_s"], value["cell_t"])], 1)
     cell = jnp.where(figured[:, None], value["blotch_size"][:, None], cell)
@@ -182,15 +183,15 @@ def _materials(key: jax.Array, roles: np.ndarray) -> Materials:
     )  # fmt: skip
 
 
-def _two_paints(value: dict[str, jax.Array], rest: jax.Array, family: jax.Array, roles: np.ndarray) -> list[jax.Array]:
-    """(L, 3) reflectances of the ground of each material and of what is filled."""
-    warm = jnp.isin(family, jnp.array([_NAMES.index(name) for name in WARM]))
+def _two_paints(value: dict[str, jax.Array], rest: jax.Array, warm, figured, blue) -> list[jax.Array]:
+    """(L, 3) reflectances of the ground of each material and of what is filled.
+
+    Where `blue`, they may be as blue as the marker: on the floor, for the marker stands.
+    """
     odd = rest[:, 14] < 0.12  # a tail of saturated paints
     ground = jnp.where(odd, jnp.sqrt(value["saturation"]), value["saturation"])
-    figured = family == _NAMES.index("figured")
     filled = jnp.where(figured, 1.0, value["saturation"]) * rest[:, 1]  # figures have a colour of their own
     second = jnp.clip(value["value"] * value["second"], 0.02, 0.9)
-    blue = roles == FLOOR  # it may be as blue as the marker, which stands
     paints = (value["value"], ground, rest[:, 0]), (second, filled, rest[:, 2])
     return [_reflectance(*one, warm, blue) for one in paints]
 
