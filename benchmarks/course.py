@@ -35,9 +35,9 @@ from whill_mjx.io.reading import read_lines
 from whill_mjx.learning.checks import mean_figures
 from whill_mjx.learning.options import TrainOptions, choose_preset, preset_name
 from whill_mjx.learning.setup import (
-    TRUTH,
     find_preset,
     functional_env,
+    learned_env,
     make_evaluation_env,
     make_training_env,
     with_layout,
@@ -125,9 +125,9 @@ def together(options: argparse.Namespace) -> None:
                 for name, value in one.items()}
 
     starts = preset.exploring_starts if options.starts is None else options.starts
-    plain = dataclasses.replace(preset, task=task, exploring_starts=starts, spread=0.0, vary=())
+    plain = dataclasses.replace(preset, task=task, learner=learner, exploring_starts=starts, spread=0.0, vary=())
     training = make_training_env(plain, vehicle)
-    env = functional_env(training, targets=TRUTH in learner.decode_only, redraw=learner.redraw)
+    env = learned_env(plain, training)
     seeds = tuple(options.seeds) if len(options.seeds) > 1 else options.seeds[0]
     limit = 60 * options.minutes if options.minutes else None
     options.out.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,8 @@ import pytest
 
 from whill_mjx.batch import make_batch
 from whill_mjx.env import make_env, observe, repainted, reset_state, step_state
-from whill_mjx.learning.setup import TRUTH, functional_env, mirror_of
+from whill_mjx.learning.identity import identity_of
+from whill_mjx.learning.setup import TRUTH, find_preset, functional_env, learned_env, mirror_of
 from whill_mjx.sensors import privileged
 from whill_mjx.sensors.camera import Camera
 from whill_mjx.sensors.depth import Depth
@@ -64,6 +65,18 @@ def test_some_ray_meets_a_box_of_the_corridor_wherever_it_stands_ahead():
         far, aside, turned = rng.uniform(0.9, 2.9), rng.uniform(-0.5, 0.5), rng.uniform(-0.8, 0.8)
         boxes = stack_boxes([box(float(body.x) + far, aside, 0.4, 0.4, 0.45, jnp.ones(3), turned)])
         assert float(privileged.free_distances(body, boxes).min()) < far
+
+
+@pytest.mark.quick
+def test_distances_from_the_outline_are_of_its_edge_in_each_direction():
+    """Points of a rectangle's edge are at half the length or half the width, and none is farther out."""
+    body = footprint(ENV.model.spec, 0.0, 0.0, 0.0)
+    edge = np.asarray(privileged.outline(body))
+    x, y = edge * np.cos(privileged.ANGLES), edge * np.sin(privileged.ANGLES)
+    furthest = np.maximum(np.abs(x) / float(body.half_length), np.abs(y) / float(body.half_width))
+    np.testing.assert_allclose(furthest, 1.0, atol=1e-6)
+    np.testing.assert_allclose(edge[[0, 12, 24, 36]], np.array([1, 0, 1, 0]) * float(body.half_length)
+                               + np.array([0, 1, 0, 1]) * float(body.half_width), atol=1e-6)
 
 
 GREY = (0.5, 0.5, 0.5)
@@ -226,6 +239,43 @@ def test_what_always_looks_the_same_and_what_sensors_observe_is_not_drawn_anew()
     assert functional_env(make_batch(env, PARAMS, 1), redraw=True).redraw is not None
     env = dataclasses.replace(env, sensors=(("camera", Camera()),))
     assert functional_env(make_batch(env, PARAMS, 1), redraw=True).redraw is None
+
+
+def test_targets_from_the_outline_reach_zero_where_the_vehicle_touches(beside_a_box):
+    """Of a wall 5 cm beside the vehicle, the ray to the left has 5 cm; of one it has run into, 0."""
+    known, whole = (jax.jit(lambda state, near=near: privileged.truth(ENV, state, near)[4:] * privileged.UNIT)
+                    for near in (True, False))  # fmt: skip
+    body = footprint(ENV.model.spec, 0.0, 0.0, 0.0)
+    near = np.asarray(known(beside_a_box))
+    np.testing.assert_allclose(near, np.asarray(whole(beside_a_box)) - privileged.outline(body), atol=1e-5)
+
+    def aside(gap):
+        wall = box(0.0, float(body.half_width) + gap + 0.2, 3.0, 0.4, 0.5, jnp.ones(3))
+        scene = dataclasses.replace(beside_a_box.scene, boxes=stack_boxes([wall]))
+        return np.asarray(known(dataclasses.replace(beside_a_box, scene=scene)))
+
+    assert aside(0.05)[12] == pytest.approx(0.05, abs=1e-3) == aside(0.05).min()
+    assert aside(-0.05)[12] == 0.0 and aside(-0.05)[36] > 1.0
+
+
+def test_the_preset_for_other_rooms_learns_distances_from_the_outline():
+    given, paper = (find_preset(name, "corridor") for name in ("transfer", "paper"))
+    assert given.from_outline and not paper.from_outline
+    batch = make_batch(ENV, PARAMS, 2)
+    seen = []
+    for preset in (given, dataclasses.replace(given, from_outline=False)):
+        env = learned_env(dataclasses.replace(preset, task=ENV.task), batch)
+        seen.append(np.asarray(jax.jit(env.reset)(jax.random.key(0))[1].obs[TRUTH]))
+    np.testing.assert_array_equal(seen[0][:, :4], seen[1][:, :4])
+    assert (seen[0][:, 4:] < seen[1][:, 4:]).all()
+
+
+def test_a_run_is_another_one_with_other_targets_and_older_runs_stay_the_same():
+    preset = find_preset("transfer", "corridor")
+    older = dataclasses.replace(preset, from_outline=False)
+    now, then = (identity_of(one, "dreamer", 0, "whill_cr", None) for one in (preset, older))
+    assert now == then | {"from_outline": True}
+    assert identity_of(preset, "ppo", 0, "whill_cr", None) == identity_of(older, "ppo", 0, "whill_cr", None)
 
 
 def test_the_targets_stand_beside_the_camera_and_are_no_input():

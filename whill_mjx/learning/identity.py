@@ -47,6 +47,7 @@ def identity_of(preset: Preset, learner: str, seed: int, vehicle: str, data: str
         settings |= {"ppo": chosen["ppo"], "total_steps": chosen["total_steps"]}  # its learning rate spans the run
     else:
         settings["dreamer"] = chosen["learner"]
+        settings |= {"from_outline": True} if preset.from_outline else {}  # older runs do not have it
     known = {"learner": learner, "seed": seed, "task": preset.task.name, "vehicle": vehicle, "data": data}
     source = source_of(preset.task)
     files = {"task_file": source, "task_data": preset.task.checksum()}

@@ -60,6 +60,8 @@ class Preset:
     looks: str | None = None
     """What changes the picture from episode to episode: "plain" nothing, "paper" what the paper randomises, "rich"
     a furnished room (`whill_mjx.world.rich`); None leaves it to the task."""
+    from_outline: bool = False
+    """Whether the free distances that a world model predicts begin at the vehicle's outline, not at its middle."""
     spread: float = 0.0
     """Relative spread of the vehicle's parameters from episode to episode, in training."""
     vary: tuple[str, ...] = ()
@@ -87,8 +89,9 @@ def find_preset(name: str, task: str | Task, steps: int | None = None) -> Preset
     behind it, what the simulator knows weighs more, half of the failed worlds are begun again, and every drive is seen
     in four paints.
     "transfer" is for a policy that drives where nobody trained: furnished rooms with other materials, light, film and
-    vehicle in each episode. In the corridor each update draws its images anew; a task without a budget of its own for
-    it takes that of "paper", with twice as many paints of each drive.
+    vehicle in each episode. Free distances to predict begin at the vehicle's outline, so that near things count most.
+    In the corridor each update draws its images anew; a task without a budget of its own for it takes that of "paper",
+    with twice as many paints of each drive.
     "wallclock" spends environment steps to save time: thousands of instances, few updates per step. "cpu" is for 2
     cores: a decision every 0.5 s, a small network on 8x8 patches; tasks may make themselves easier for it. "smoke" only
     shows that everything runs.
@@ -152,7 +155,9 @@ def _preset(name: str, task: Task, budget: Budget) -> Preset:
                 greedy_share=0.25, decode_only=(TRUTH,),
             )  # fmt: skip
             preset = Preset(task, learner, budget.steps, eval_episodes=200)
-            return dataclasses.replace(preset, looks="rich", spread=0.1) if name == "transfer" else preset
+            if name == "paper":
+                return preset
+            return dataclasses.replace(preset, looks="rich", spread=0.1, from_outline=True)
         case "wallclock":
             learner = learner_preset(
                 "size12m", train_ratio=4.0, batch_size=64, learning_starts=150_000, lr=3e-4, entropy_scale=1e-3,
@@ -272,8 +277,9 @@ def to_transition(step: TimeStep, people: People | None) -> Transition:
 
 
 def functional_env(
-    batch: BatchEnv, safety: Safety | None = None, shaped: bool = True, targets: bool = False, redraw: bool = False
-) -> FunctionalEnv:
+    batch: BatchEnv, safety: Safety | None = None, shaped: bool = True, targets: bool = False, redraw: bool = False,
+    from_outline: bool = False,
+) -> FunctionalEnv:  # fmt: skip
     """The learner's view of a batch of chairs, with left and right as its mirror.
 
     Args:
@@ -282,6 +288,7 @@ def functional_env(
         shaped: False leaves the reward the task's own, as evaluations must.
         targets: show what only the simulator knows too, as TRUTH beside "camera"; it is no input of a policy.
         redraw: images can be drawn anew, in other looks; the mirror then shows the images that it is given.
+        from_outline: the targets' free distances begin at the vehicle's outline, not at its middle.
 
     Raises:
         ValueError: a collision monitor is asked for, and nothing scans.
@@ -297,7 +304,7 @@ def functional_env(
         transition = to_transition(step, state.env.scene.people)
         if not targets:
             return transition
-        known = jax.vmap(lambda one: privileged.truth(batch.env, one))(state.env)
+        known = jax.vmap(lambda one: privileged.truth(batch.env, one, from_outline))(state.env)
         seen: Any = step.obs if batch.env.sensors else {"camera": step.obs}
         return dataclasses.replace(transition, obs={**seen, TRUTH: known})
 
@@ -326,6 +333,13 @@ def functional_env(
     again = redraw_of(batch) if redraw else None
     mirror = mirror_of(batch, paints=again is None)
     return FunctionalEnv(batch.count, shape, 2, reset, step, mirror, again)
+
+
+def learned_env(preset: Preset, batch: BatchEnv) -> FunctionalEnv:
+    """What a preset's world model learns from: `functional_env` with the preset's safety and targets."""
+    learner = preset.learner
+    known = TRUTH in learner.decode_only
+    return functional_env(batch, preset.safety, True, known, learner.redraw, preset.from_outline)
 
 
 def with_truth(shape: Any) -> dict[str, tuple[int, ...]]:
@@ -429,12 +443,10 @@ def mirror_worlds(env: Env) -> int:
 
 def check_learner(preset: Preset, learner: str, batch: BatchEnv) -> None:
     """Raise ValueError where a preset's learner, "dreamer" or "ppo", does not suit what it would train on."""
-    redraw, known = preset.learner.redraw, learner == "dreamer" and TRUTH in preset.learner.decode_only
-    env = functional_env(batch, preset.safety, targets=known, redraw=redraw)
     if learner == "dreamer":
-        check_fit(env, preset.learner, preset.total_steps)
+        check_fit(learned_env(preset, batch), preset.learner, preset.total_steps)
     else:
-        ppo.check_fit(env, preset.ppo)
+        ppo.check_fit(functional_env(batch, preset.safety), preset.ppo)
     _, carry = (dreamer_policy if learner == "dreamer" else ppo_policy)(preset, batch.env)
     taken = {"action", *(f"{way}_{name}" for name in carry for way in ("carry", "next"))}
     for name in taken & {name for name, _ in batch.env.sensors}:

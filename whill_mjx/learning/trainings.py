@@ -23,10 +23,10 @@ from whill_mjx.learning.kept import kept_programs
 from whill_mjx.learning.options import TrainOptions
 from whill_mjx.learning.ppo_training import Length, train_ppo
 from whill_mjx.learning.setup import (
-    TRUTH,
     Preset,
     dreamer_policy,
     functional_env,
+    learned_env,
     make_evaluation_env,
     make_training_env,
     ppo_policy,
@@ -57,7 +57,7 @@ def train_policy(options: TrainOptions, preset: Preset, vehicle: Path, stage: St
     evaluate = evaluation_of(held_out, preset, options.seed, kept)
     stopper = Stopper(options.out, preset.stop_success)
     result = train(
-        functional_env(batch, preset.safety, True, TRUTH in preset.learner.decode_only, preset.learner.redraw),
+        learned_env(preset, batch),
         preset.learner,
         options.out,
         stopper.total_steps(preset.total_steps),

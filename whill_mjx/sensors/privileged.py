@@ -1,7 +1,8 @@
 """What only the simulator knows: for critics and for targets of a world model, never for a policy that is to drive.
 
 The vector is in the body frame, centred on the footprint (x ahead, y to the left): goal, speeds, and the free distance
-in `RAYS` directions. Lengths are in units of `UNIT`, so that the learner's symlog resolves the near ones.
+in `RAYS` directions, from the footprint's middle or from its outline. Lengths are in units of `UNIT`, so that the
+learner's symlog resolves the near ones.
 """
 
 from __future__ import annotations
@@ -46,8 +47,14 @@ class Privileged(Sensor):
         return mirrored(value)
 
 
-def truth(env: Any, state: Any) -> jax.Array:
-    """(SIZE,) float32: goal x, y, forward speed, yaw rate, free distances; of one instance."""
+def truth(env: Any, state: Any, from_outline: bool = False) -> jax.Array:
+    """(SIZE,) float32: goal x, y, forward speed, yaw rate, free distances; of one instance.
+
+    Args:
+        env: with the vehicle and the task.
+        state: of one instance.
+        from_outline: take off each free distance what the vehicle covers of it: at 0 the vehicle touches something.
+    """
     x, y, yaw = reference_pose(env.model, state.vehicle.qpos)
     v, omega = body_twist(env.model, state.vehicle.qpos, state.vehicle.qvel)
     body = footprint(env.model.spec, x, y, yaw)
@@ -59,6 +66,8 @@ def truth(env: Any, state: Any) -> jax.Array:
         height = HEIGHT if state.scene.walls is None else min(HEIGHT, state.scene.walls.height)
         there = first_hits(in_plane(state.scene, body, height), body.x, body.y, body.yaw + ANGLES, height)
         free = jnp.minimum(free, there)
+    if from_outline:
+        free = jnp.maximum(free - outline(body), 0.0)
     return jnp.concatenate([near, free / UNIT]).astype(jnp.float32)
 
 
@@ -93,6 +102,12 @@ def in_plane(scene: Scene, body: Footprint, height: float) -> Scene:
 def free_distances(body: Footprint, boxes: Boxes) -> jax.Array:
     """(RAYS,) m from the footprint's centre to the first box in each direction of ANGLES, at most RANGE."""
     return distances(body.x, body.y, body.yaw + ANGLES, boxes, RANGE, (0.0, body.height))
+
+
+def outline(body: Footprint) -> jax.Array:
+    """(RAYS,) m from the footprint's middle to its edge in each direction of ANGLES."""
+    ahead, aside = np.maximum(np.abs(np.cos(ANGLES)), 1e-9), np.maximum(np.abs(np.sin(ANGLES)), 1e-9)
+    return jnp.minimum(body.half_length / ahead, body.half_width / aside)
 
 
 def mirrored(values: jax.Array) -> jax.Array:
