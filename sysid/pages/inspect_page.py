@@ -10,9 +10,9 @@ import numpy as np
 
 from sysid.logs.records import Log
 from sysid.logs.stream_quality import speeds
-from sysid.pages.plots import pyplot, save
 from whill_mjx.io.folders import write_whole
 from whill_mjx.io.html import Cell, Section, bullets, html_page, paragraph, png, table
+from whill_mjx.io.png import pyplot, save_figure
 
 MAX_ROWS = 60  # trials listed one by one
 STREAMS = {"command": "commands", "odometry": "odometry", "ground_truth": "outside pose"}
@@ -120,7 +120,7 @@ def write_plot(path: Path, log: Log, found: dict[str, Any]) -> Path:
     lower.suptitle("Standard deviation between replicates: no model can predict better", fontsize=11)
     _spread(lower.subplots(1, len(UNITS), sharey=True), found)
     figure.suptitle(f"{log.name}: {len(log.trials)} trials, {found['log']['seconds']:.0f} s")
-    return save(figure, path, 100)
+    return save_figure(figure, path, 100)
 
 
 def _label(axis: Any, title: str, across: str, up: str) -> None:

@@ -10,31 +10,11 @@ import numpy as np
 
 from sysid.pages.series import REPLAYED, Channel, TrialSeries
 from sysid.search.result import Trace
-from whill_mjx.io.folders import whole_file
+from whill_mjx.io.png import pyplot, save_figure
 from whill_mjx.io.svg import COLOURS
 
 SMALLEST_PANEL = 0.2  # m; a turn on the spot would fill the panel with its noise
 STYLES = {"measured": "-", "ideal": ":", "initial": "--", "fitted": "-"}
-
-
-def pyplot() -> Any:
-    """Matplotlib without a window."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
-
-
-def save(figure: Any, path: Path, dpi: int) -> Path:
-    """Write a figure, whole or not at all, and close it."""
-    try:
-        with whole_file(path) as temporary:
-            figure.savefig(temporary, dpi=dpi)
-    finally:
-        pyplot().close(figure)
-    return path
 
 
 def write_plots(folder: Path, series: Sequence[TrialSeries], rows: list[dict[str, Any]]) -> list[Path]:
@@ -88,7 +68,7 @@ def _write_panels(
             reach, start = np.array([-0.5, 0.5]) * SMALLEST_PANEL, channel.values["fitted"][0, :2]
             axis.plot(start[0] + reach, start[1] + reach, alpha=0.0)
     axes.flat[0].legend(fontsize=7)
-    return save(figure, path, dpi)
+    return save_figure(figure, path, dpi)
 
 
 def _error_bars(path: Path, rows: list[dict[str, Any]], names: set[str]) -> Path:
@@ -108,7 +88,7 @@ def _error_bars(path: Path, rows: list[dict[str, Any]], names: set[str]) -> Path
     axes[0].set_title(f"Error per trial, {channel.replace('_', ' ')} (* held out)")
     axes[1].set_xticks(range(len(mine)), [row["trial"] + ("*" if row["held_out"] else "") for row in mine],
                        rotation=60, ha="right", fontsize=8)
-    return save(figure, path, 110)
+    return save_figure(figure, path, 110)
 
 
 def write_search_plot(path: Path, traces: Sequence[Trace]) -> Path:
@@ -138,7 +118,7 @@ def write_search_plot(path: Path, traces: Sequence[Trace]) -> Path:
             axis.set_ylabel(label)
             axis.grid(alpha=0.3, which="both")
     axes[0, 1].legend(fontsize=8)
-    return save(figure, path, 120)
+    return save_figure(figure, path, 120)
 
 
 def _median_step(steps: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

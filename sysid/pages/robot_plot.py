@@ -7,9 +7,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from sysid.pages.plots import pyplot, save
 from sysid.replay.robot import Robot
 from sysid.replay.robot_contacts import ROUND, corners
+from whill_mjx.io.png import pyplot, save_figure
 
 DRIVEN, FLOOR, REST = "#d95f02", "#1b9e77", "#bbbbbb"
 AROUND = 32  # points of a rim
@@ -42,7 +42,7 @@ def write_robot(path: Path, robot: Robot, loads: dict[str, float]) -> None:
     floor = int(np.flatnonzero(host.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE))[0])
     axes[1].axhline(float(data.geom_xpos[floor, 2]), color="k", lw=0.8)
     figure.suptitle(f"{robot.path.name}: driven wheels orange, other supports green")
-    save(figure, path, 110)
+    save_figure(figure, path, 110)
 
 
 def _outline(host: mujoco.MjModel, geom: int) -> np.ndarray:

@@ -265,7 +265,7 @@ def walled(task, place):
 
 @pytest.mark.quick
 def test_a_picture_of_any_world_holds_path_goal_walls_and_posts():
-    plt, task = pages._pyplot(), make_task("point_goal")
+    plt, task = pages.pyplot(), make_task("point_goal")
     for place, path in (((12.0, 5.0), [[18.0, 2.0], [12.5, 5.0]]), ((-3.0, -1.0), [[0.0, 0.0], [-2.8, -0.9]])):
         figure, axes = plt.subplots()
         pages.draw_scene(axes, walled(task, place), 0.5, np.array(path))
@@ -480,7 +480,7 @@ def test_the_page_of_an_evaluation_has_words_and_the_style_of_all_reports(evalua
 
 @pytest.mark.parametrize("columns", [1, 2])
 def test_the_legend_of_few_maps_is_not_wider_than_their_picture(columns):
-    plt = pages._pyplot()
+    plt = pages.pyplot()
     figure, _ = plt.subplots(1, columns, figsize=(3.2 * columns, 2.2), layout="constrained")
     pages._legend(figure, set(pages.ENDINGS), columns)
     figure.canvas.draw()

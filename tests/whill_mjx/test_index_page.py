@@ -71,7 +71,7 @@ def test_the_reward_curve_counts_the_steps_of_the_progress_bar(tmp_path, monkeyp
     lines = [{"env_steps": steps, "eval/return": steps / 10, "eval/success": 0.5} for steps in (200, 400)]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     drawn = []
-    monkeypatch.setattr("whill_mjx.evaluation.output.pictures._save", lambda figure, out: drawn.append(figure))
+    monkeypatch.setattr("whill_mjx.evaluation.output.pictures.save_figure", lambda figure, out: drawn.append(figure))
     reward_curve(tmp_path / "metrics.jsonl", tmp_path / "curve.png", action_repeat=5)
     for axes in drawn[0].axes:
         assert [list(line.get_xdata()) for line in axes.get_lines()] == [[200, 400]]

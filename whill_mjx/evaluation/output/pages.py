@@ -10,11 +10,12 @@ import jax
 import numpy as np
 
 from whill_mjx.evaluation.episodes import MEANS, OF_SUCCESSES, SHARES, Episodes, shares_of
-from whill_mjx.evaluation.output.pictures import _corners, _pyplot, _save
+from whill_mjx.evaluation.output.pictures import _corners
 from whill_mjx.evaluation.sweeps import Sweep
 from whill_mjx.io import html
 from whill_mjx.io.fields import percent
 from whill_mjx.io.folders import write_whole
+from whill_mjx.io.png import pyplot, save_figure
 from whill_mjx.io.video import write_h264
 from whill_mjx.world.collision import from_above
 
@@ -43,7 +44,7 @@ def _ended(how: str) -> str:
 
 def draw_scene(axes: Any, scene: Any, goal_radius: float, path: np.ndarray) -> None:
     """Boxes, walls, round things and goal of one scene from above, around a path (T, 2) [m]."""
-    boxes, pyplot = scene.boxes, _pyplot()
+    boxes, plt = scene.boxes, pyplot()
     for box in range(boxes.yaw.shape[0]):
         if boxes.mask[box]:
             corners = _corners(boxes.centre[box], boxes.half[box], float(boxes.yaw[box]))
@@ -57,9 +58,9 @@ def draw_scene(axes: Any, scene: Any, goal_radius: float, path: np.ndarray) -> N
         for number in np.flatnonzero(rounds.mask):
             colour = np.clip(scene.solids.rounds.colour[number], 0, 1)
             for end in (rounds.start[number], rounds.end[number]):
-                axes.add_patch(pyplot.Circle(end, rounds.radius[number], color=colour))
+                axes.add_patch(plt.Circle(end, rounds.radius[number], color=colour))
     goal = np.asarray(scene.marker.position[:2])
-    axes.add_patch(pyplot.Circle(goal, goal_radius, fill=False, color="tab:blue", linestyle=":"))
+    axes.add_patch(plt.Circle(goal, goal_radius, fill=False, color="tab:blue", linestyle=":"))
     axes.plot([goal[0]], [goal[1]], "s", color="tab:blue", markersize=4)
     low, high = _frame(path, goal)
     axes.set_xlim(low[0], high[0])
@@ -79,7 +80,7 @@ def _frame(path: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: int = 12, columns: int = 4) -> Path:
     """Small maps of the first `count` episodes with a legend and a scale bar; paths are coloured by how they ended."""
-    plt = _pyplot()
+    plt = pyplot()
     count = min(count, episodes.count)
     columns = min(columns, count)
     rows = -(-count // columns)
@@ -98,7 +99,7 @@ def paths_from_above(episodes: Episodes, goal_radius: float, out: Path, count: i
         _scale_bar(axes)
     figure.get_layout_engine().set(h_pad=0.12)
     _legend(figure, {ending(episodes, index) for index in range(count)}, min(3, columns))
-    return _save(figure, out)
+    return save_figure(figure, out)
 
 
 def _scale_bar(axes: Any, metres: float = 1.0) -> None:
@@ -130,7 +131,7 @@ def sweep_picture(sweep: Sweep, out: Path, name: str) -> Path:
 
 
 def _curve(sweep: Sweep, out: Path, name: str) -> Path:
-    plt = _pyplot()
+    plt = pyplot()
     axis = sweep.axes[0]
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     numeric = axis.name != "vehicle"
@@ -147,11 +148,11 @@ def _curve(sweep: Sweep, out: Path, name: str) -> Path:
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     axes.set_title(name, fontsize=9)
-    return _save(figure, out)
+    return save_figure(figure, out)
 
 
 def _heat_map(sweep: Sweep, out: Path, name: str) -> Path:
-    plt = _pyplot()
+    plt = pyplot()
     rows, columns = sweep.axes
     figure, panels = plt.subplots(1, 2, figsize=(5.2 + 1.1 * len(columns.values), 1.7 + 0.5 * len(rows.values)),
                                   layout="constrained")
@@ -167,12 +168,12 @@ def _heat_map(sweep: Sweep, out: Path, name: str) -> Path:
         panel.set_title(f"{share} [%]", fontsize=9)
         figure.colorbar(image, ax=panel, shrink=0.9)
     figure.suptitle(f"{name}, {sweep.episodes} episodes per cell", fontsize=9)
-    return _save(figure, out)
+    return save_figure(figure, out)
 
 
 def sweep_paths(sweep: Sweep, out: Path, goal_radius: float) -> Path:
     """Paths of every cell from above, on the scene of its first episode."""
-    plt = _pyplot()
+    plt = pyplot()
     shape = (1, *sweep.figures["success"].shape)[-2:]
     figure, grid = plt.subplots(*shape, squeeze=False, layout="constrained",
                                 figsize=(2.6 * shape[1] + 0.4, 1.9 * shape[0] + 0.3))
@@ -183,7 +184,7 @@ def sweep_paths(sweep: Sweep, out: Path, goal_radius: float) -> Path:
             axes.plot(path[:, 0], path[:, 1], color="tab:purple", linewidth=0.6, alpha=0.5)
         axes.set_title(f"{', '.join(label)}: {100 * sweep.figures['success'].flat[index]:.0f} %", fontsize=7)
         axes.set_axis_off()
-    return _save(figure, out)
+    return save_figure(figure, out)
 
 
 def episode_video(

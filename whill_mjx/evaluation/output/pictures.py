@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from whill_mjx.io.folders import whole_file
+from whill_mjx.io.png import pyplot, save_figure
 from whill_mjx.io.reading import read_lines
 
 
@@ -21,7 +21,7 @@ def reward_curve(
         reference: adds horizontal lines of return.
         action_repeat: control periods of a step; the axis says so.
     """
-    plt = _pyplot()
+    plt = pyplot()
     lines = [line for _, line in read_lines(metrics)]
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
     for name, label, style in (("episode/return", "training episodes", "-"), ("eval/return", "evaluation", "o-")):
@@ -45,7 +45,7 @@ def reward_curve(
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8)
-    return _save(figure, out)
+    return save_figure(figure, out)
 
 
 def _corners(centre: np.ndarray, half_size: np.ndarray, yaw: float) -> np.ndarray:
@@ -53,19 +53,3 @@ def _corners(centre: np.ndarray, half_size: np.ndarray, yaw: float) -> np.ndarra
     signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     cos, sin = np.cos(yaw), np.sin(yaw)
     return centre[:2] + (signs * half_size[:2]) @ np.array([[cos, sin], [-sin, cos]])
-
-
-def _pyplot():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt
-
-
-def _save(figure, out: Path) -> Path:
-    with whole_file(out) as temporary:
-        figure.savefig(temporary, dpi=130)
-    _pyplot().close(figure)
-    return out
