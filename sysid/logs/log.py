@@ -38,7 +38,6 @@ from whill_mjx.io.reading import read_csv as read_table
 from whill_mjx.io.reading import read_toml
 from whill_mjx.vehicle.specs import HUSKY, SPECS, WHILL_CR, VehicleSpec, in_proportion
 
-SCHEMA = 1
 STANDSTILL = 1.0  # longest part of a trial's start that is used to find its start pose [s]
 START_NOISE = 0.03  # m/s, rad/s below which a trial that begins with a command to move begins at rest
 

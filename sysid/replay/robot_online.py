@@ -12,7 +12,7 @@ import numpy as np
 
 from sysid.replay.robot_drive import RobotDrive
 from sysid.replay.robot_loading import load_robot
-from sysid.replay.robot_vehicle import extent_of
+from sysid.replay.robot_vehicle import outline_of
 from whill_mjx.vehicle.specs import VehicleSpec, in_proportion
 
 
@@ -36,12 +36,10 @@ class OnlineRobot:
 
     def spec(self, base: VehicleSpec) -> VehicleSpec:
         """Sizes and outline of the robot; limits and camera are those of `base`, and the rest in proportion to it."""
-        robot, (low, high) = self.robot, extent_of(self.robot)
-        length, width, height = (high - low).tolist()
+        robot, (middle, body) = self.robot, outline_of(self.robot)
         mass = float(robot.host.body_subtreemass[robot.base])
         spec = in_proportion(base, robot.path.stem, robot.wheel_radius, robot.track, mass=mass)
-        return replace(spec, drive="differential", driven_axle="rear", rear_axle_x=-float(low[0] + high[0]) / 2,
-                       body_length=length, body_width=width, body_height=height, camera=base.camera)
+        return replace(spec, drive="differential", driven_axle="rear", rear_axle_x=-middle, camera=base.camera, **body)
 
     def place(self, x: float, y: float, yaw: float) -> None:
         """Stand still with the middle between the driven wheels at x, y [m], heading yaw [rad]."""

@@ -1,13 +1,8 @@
-"""A robot as a vehicle of the simulator, where its kind has one.
+"""A robot as a vehicle of the simulator, where its kind has one (docs/models.md).
 
-Two driven wheels and supports that slide: what a fit of the robot knows goes over value by value, namely mass
-distribution, true sizes of wheels, controller, friction, and all effects around it. What a contact solver has no number
-for, such as how a tyre creeps, is taken for stiff.
-
-Skid-steered: the vehicle is fitted in place of the robot. Rigid wheels on a rigid frame chatter in MuJoCo's contacts
-while they slide, so that a change of 0.01 % of a size turns the robot otherwise by 5 % of a quarter turn, and how far
-it turns follows from the rotors' inertia, which is not that of a real tyre. The vehicle's tyres have a law of sliding
-whose grip along and across is fitted.
+Two driven wheels and supports that slide: what a fit of the robot knows goes over value by value. What a contact solver
+has no number for, such as how a tyre creeps, is taken for stiff. Skid-steered: the vehicle is fitted in place of the
+robot, since rigid wheels chatter in MuJoCo's contacts while they slide.
 """
 
 from __future__ import annotations
@@ -32,6 +27,7 @@ CREEP, SIDE_CREEP = 0.002, 0.005  # m/s, sliding speeds of a stiff tyre along an
 SAG = 0.01  # of the wheel radius, of hard tyres; with a chair's 5 mm a robot of 6 cm wheelbase tips over when it brakes
 DRIVE = {"drive.kp": "torque_drive.kp", "drive.ki": "torque_drive.ki", "drive.limit": "torque_drive.limit"}
 FRICTION = ".friction"
+SIZES = ("body_length", "body_width", "body_height")
 ROUNDED = 1e-3
 """Shares of the weight up to this are of axles that a file places with few digits."""
 
@@ -59,11 +55,9 @@ def vehicle_of(
         return "it stands on supports before and behind its axle"
     support = float(ahead.mean())
     share = float(np.clip(com[0] / support, 0.0, 1.0))  # of the weight, that the supports carry
-    low, high = extent_of(robot)
-    length, width, height = (high - low).tolist()
+    middle, body = outline_of(robot)
     spec = replace(spec, mass=mass, drive="differential", driven_axle="rear" if support > 0 else "front",
-                   wheelbase=abs(support), rear_axle_x=min(support, 0.0) - float(low[0] + high[0]) / 2,
-                   wheel_inertia=robot.spin, body_length=length, body_width=width, body_height=height)
+                   wheelbase=abs(support), rear_axle_x=min(support, 0.0) - middle, wheel_inertia=robot.spin, **body)
     (tyre, wheels), (ball, balls) = (
         _friction(robot, entries, values, geoms) for geoms in (
             tuple(parts(robot.host, robot.host.jnt_bodyid[robot.joints[0]]).tolist()), robot.sliding))
@@ -109,13 +103,12 @@ def skid_vehicle(robot: Robot, spec: VehicleSpec) -> Twin:
     share = 1 - float(np.mean((axles - middle) ** 2)) / half**2 if len(axles) > 4 and half > 0 else 0.0
     half = round(half, 6)
     mass, com, yaw_inertia = _mass_of(robot, {})
-    low, high = extent_of(robot)
-    length, width, height = (high - low).tolist()
+    centre, body = outline_of(robot)
     bare = robot.spin - float(np.mean(host.dof_armature[list(robot.wheels)]) if robot.added else 0.0)
     wheels = len(robot.wheels) // 2
     spin = max(bare, ROTOR_SHARE * mass * robot.wheel_radius**2 / len(robot.wheels))
-    spec = replace(spec, mass=mass, drive="skid", wheelbase=2 * half, rear_axle_x=-half - float(low[0] + high[0]) / 2,
-                   wheel_inertia=wheels * spin, body_length=length, body_width=width, body_height=height)
+    spec = replace(spec, mass=mass, drive="skid", wheelbase=2 * half, rear_axle_x=-half - centre,
+                   wheel_inertia=wheels * spin, **body)
     found = {"body.mass": mass, "body.yaw_inertia": yaw_inertia, "body.com_x": spec.reference_x + com[0],
              "body.com_y": com[1], "body.com_z": com[2], **({"middle_wheels.share": share} if share > ROUNDED else {})}
     params = with_effects(in_short(spec, "physical"), ("middle_wheels",) if share > ROUNDED else ())
@@ -142,15 +135,17 @@ def _mass_of(robot: Robot, arrays: dict[str, np.ndarray]) -> tuple[float, np.nda
     return mass, centre, float(inertia)
 
 
-def extent_of(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest place (3,) of its geoms at rest: ahead of the driven axle's middle, to the left and up [m]."""
+def outline_of(robot: Robot) -> tuple[float, dict[str, Any]]:
+    """How far the middle of the box around its geoms is ahead of the driven axle at rest, and the box's sizes, by their
+    names in a spec [m]."""
     host, data, axes = robot.host, robot.resting, robot.axes
     geoms = np.flatnonzero(host.body_rootid[host.geom_bodyid] == robot.base)
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     middle = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, host.geom_aabb[geoms, :3])
     middle = (middle - tyre_places(host, data, robot.joints).mean(0)) @ axes.T
     reach = np.einsum("gij,gj->gi", np.abs(axes @ turns), host.geom_aabb[geoms, 3:])
-    return (middle - reach).min(0), (middle + reach).max(0)
+    low, high = (middle - reach).min(0), (middle + reach).max(0)
+    return float(low[0] + high[0]) / 2, dict(zip(SIZES, (high - low).tolist(), strict=True))
 
 
 def _friction(

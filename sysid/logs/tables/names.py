@@ -64,8 +64,7 @@ def by_name(table: Table, name: str) -> Column | None:
             return None  # the rest of a second; joined with secs when read
         last = unit_of(words[-1])
         return Column("time", table.stem, name, unit or (last if last in ("min", "h", "d") else ""), "its name")
-    stream_words = {one for known in STREAM_WORDS.values() for one in known}
-    quantity = _quantity([word for word in words if word not in stream_words] or words)
+    quantity = _quantity([word for word in words if word not in STREAM_LAST] or words)
     if quantity is None:
         return None
     if quantity == "yaw" and unit in UNITS["rate"] and not PLURALS & set(words_of(name)):
