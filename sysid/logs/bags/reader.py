@@ -70,8 +70,7 @@ def read_bag(
         store = get_typestore(Stores.ROS2_HUMBLE)
         store.register(get_types_from_msg(CHAIR_DEFINITION + JOYSTICK_FIELDS, f"whill_msgs/msg/{CHAIR_STATE}"))
         with _opened(AnyReader, path, store, notes) as reader:
-            known = {name: about.msgtype or " and ".join(sorted({short_type(one.msgtype) for one in about.connections}))
-                     for name, about in reader.topics.items() if about.msgcount}
+            known = {name: about.msgtype or _types_of(about) for name, about in reader.topics.items() if about.msgcount}
             asked = topics or {}
             chosen = choose_topics(path, known, {**asked, **dict.fromkeys(framed(known, asked), "")}, notes, wheels)
             rows = _rows(reader, {topic: stream for stream, topic in chosen.items()}, notes)
@@ -101,6 +100,11 @@ def read_bag(
         elif len(kept):
             notes.append(f"{topic}: {len(kept)} usable messages; it is left out")
     return Bag(path, streams, notes)
+
+
+def _types_of(topic: Any) -> str:
+    """The types of a topic that has several, joined by "and"."""
+    return " and ".join(sorted({short_type(one.msgtype) for one in topic.connections}))
 
 
 @contextmanager
