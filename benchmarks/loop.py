@@ -14,24 +14,26 @@ fails is named with its log. RUN/report.html shows before and after.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from benchmarks.loop_direct import drive_directly, write_answers
-from benchmarks.loop_drives import Plan, StageError, drive_plans, last_line, station
+from benchmarks.loop_drives import Plan, StageError, Station, drive_plans, last_line, station
 from benchmarks.loop_figures import collect, summary
 from benchmarks.loop_page import write_page
 from benchmarks.plant.chair import VEHICLES
 from benchmarks.plant.commands import nine
 from benchmarks.plant.draw import draw_effect
+from benchmarks.ros_domains import free_domain
 from whill_mjx.io.command_line import COUNT, SEED, OptionError, Range, run
 from whill_mjx.io.folders import claim_folder, write_whole
 
@@ -78,7 +80,7 @@ class Options:
     """Drive the plant in this process, without topics: the same drives in seconds, on a computer without ROS. A run may
     go on so that was driven over topics; its stages say which."""
     domain: Annotated[int | None, Range(0, 101)] = None
-    """ROS domain; none takes one by the process's number."""
+    """ROS domain; none takes one that no other loop of this computer holds."""
     collect: tuple[Path, ...] = ()
     """Only record the figures of these runs, each with another draw, into bridge.json."""
 
@@ -152,9 +154,16 @@ class Loop:
                   "--wheelbase", str(nominal.wheelbase), "--mass", str(nominal.mass)]
         if held_out:
             saying += ["--held-out", *held_out]
-        domain = self.options.domain if self.options.domain is not None else 1 + os.getpid() % 100
-        with station(domain, self.out / "logs" / stage) as here:
+        with self.hold_station(stage) as here:
             drive_plans(here, plans, dataset, plant, saying)
+
+    @contextlib.contextmanager
+    def hold_station(self, stage: str) -> Iterator[Station]:
+        """A station with the logs of a stage, on the domain that was asked for or one that nobody else holds."""
+        asked = self.options.domain
+        with free_domain() if asked is None else contextlib.nullcontext(asked) as domain:
+            with station(domain, self.out / "logs" / stage) as here:
+                yield here
 
     def plans(self, replicates: int) -> list[Plan]:
         """The manoeuvres as command files."""
@@ -244,8 +253,7 @@ class Loop:
     def do_drive(self) -> str:
         """Let the policy drive the plant over ROS topics."""
         policy, results = self.out / "train" / "policy", self.out / "drive.json"
-        domain = self.options.domain if self.options.domain is not None else 1 + os.getpid() % 100
-        with station(domain, self.out / "logs" / "drive") as here:
+        with self.hold_station("drive") as here:
             here.start("policy", "bridge.drive", str(policy), "--base", "generic")
             process = here.start(
                 "simulate", "bridge.simulate", str(policy), "--simulator", "benchmarks.loop_world:contact_vehicle",

@@ -7,7 +7,8 @@ never pulled, and /clock. `--draw N` builds in one effect, drawn by N, which not
 
 Simulated time runs `--speed` times as fast as the wall clock, and waits for its driver. A driver sends a command every
 50 ms of simulated time; where the next one is late, because the computer is busy, time stands until it is there. So a
-drive does not depend on the load of the machine. After PATIENCE the driver counts as gone, and time goes on.
+drive does not depend on the load of the machine. After PATIENCE time goes on by a step, and waits again: while nobody
+drives, it nearly stands.
 
 Between two trials somebody carries a vehicle back to its start. Here the call `reset` does (`bridge.episodes`), with
 the number of the trial as the seed; the port is printed at the start.

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from benchmarks import loop, loop_figures
-from benchmarks.loop import Options, main
+from benchmarks import loop, loop_figures, ros_domains
+from benchmarks.loop import Loop, Options, main
 from benchmarks.loop_figures import removed, summary
 from benchmarks.loop_page import write_page
 from whill_mjx.io.command_line import OptionError
@@ -95,6 +95,17 @@ def test_a_proposed_manoeuvre_is_driven_on_the_reference_days_too_and_the_second
 def test_a_stage_that_fails_is_named_with_what_to_do(tmp_path):
     with pytest.raises(OSError, match=r"stage days: .*none.day_1 is missing.*give the same command again"):
         main(Options(tmp_path / "run", days_of=tmp_path / "none", **TINY))
+
+
+@pytest.mark.quick
+def test_two_loops_of_one_computer_do_not_hear_each_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(ros_domains.random, "randrange", lambda _: 6)
+    one, other, asked = (Loop(Options(tmp_path / name, domain=domain))
+                         for name, domain in (("one", None), ("other", None), ("asked", 42)))
+    with one.hold_station("days") as first, other.hold_station("days") as second, asked.hold_station("days") as third:
+        assert first.domain != second.domain and third.domain == 42
+        with one.hold_station("drive") as next_stage:
+            assert next_stage.domain not in (first.domain, second.domain)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed")

@@ -4,7 +4,9 @@ import importlib.util
 
 import pytest
 import tiny_policy
-from ros_graph import Graph, free_domain
+from ros_graph import Graph
+
+from benchmarks.ros_domains import free_domain
 
 
 @pytest.fixture

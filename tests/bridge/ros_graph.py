@@ -1,14 +1,10 @@
 """Processes and plain ROS nodes on a domain of their own, for the tests of the nodes."""
 
 import contextlib
-import fcntl
-import itertools
 import os
-import random
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -18,32 +14,6 @@ import pytest
 from benchmarks.bridge_robot import Robot
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-LINGER = 5.0
-"""Seconds for which what a test left behind may still speak: a guard stops the vehicle of a node that was killed."""
-
-
-@contextlib.contextmanager
-def free_domain():
-    """Hold a ROS domain that no other test of this machine uses now, and none used just before."""
-    first = random.randrange(100)
-    for domain in (1 + (first + i) % 100 for i in itertools.count()):
-        with open(Path(tempfile.gettempdir()) / f"ros-domain-{domain}.lock", "a") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
-            about = os.fstat(lock.fileno())
-            if about.st_size and time.time() - about.st_mtime < LINGER:
-                continue
-            try:
-                yield domain
-            finally:
-                lock.truncate(0)
-                lock.write("used")  # at this time
-            return
-
 
 WAIT = 120
 """Seconds after which a condition counts as one that never comes true; a machine that tests in parallel is slow."""
