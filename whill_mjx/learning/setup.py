@@ -337,9 +337,8 @@ def functional_env(
 
 def learned_env(preset: Preset, batch: BatchEnv) -> FunctionalEnv:
     """What a preset's world model learns from: `functional_env` with the preset's safety and targets."""
-    learner = preset.learner
-    known = TRUTH in learner.decode_only
-    return functional_env(batch, preset.safety, True, known, learner.redraw, preset.from_outline)
+    known, redraw = TRUTH in preset.learner.decode_only, preset.learner.redraw
+    return functional_env(batch, preset.safety, targets=known, redraw=redraw, from_outline=preset.from_outline)
 
 
 def with_truth(shape: Any) -> dict[str, tuple[int, ...]]:
