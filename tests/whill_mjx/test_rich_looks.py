@@ -88,10 +88,10 @@ def test_the_cells_of_a_material_are_the_same_where_a_gpu_rounds_down_by_a_sum(f
     rng = np.random.default_rng(0)
     numbers = rng.uniform(0.2, 3.0, NUMBERS).astype(np.float32)
     numbers[16], numbers[26] = 0.2, figure
-    place = [jnp.asarray(rng.uniform(-4, 4, 500), jnp.float32) for _ in range(3)]
-    rows = [jnp.float32(value) for value in rng.uniform(-1, 1, 18)]
+    s, t, height = (jnp.asarray(rng.uniform(-4, 4, 500), jnp.float32) for _ in range(3))
     label = jnp.asarray(rng.integers(0, 30, 500))
-    surface = Surface(rows, [jnp.float32(value) for value in numbers], label, place, jnp.float32(0.01))
+    material = [jnp.float32(value) for value in numbers]
+    surface = Surface((s, t), material, label, height, jnp.float32(0.01))
 
     def paint_by(floor, whole):
         small = lambda integer: integer.astype(jnp.float32)  # noqa: E731

@@ -268,7 +268,7 @@ class Arrays(Everywhere):
         return jax.lax.optimization_barrier(values)
 
     def word(self, code) -> jax.Array:
-        return self.tables.words.reshape(-1)[code]
+        return self.tables.words.reshape(-1)[code]  # type: ignore[union-attr]
 
     def dark_word(self, code) -> jax.Array:
         return self.tables.dark.reshape(-1)[code]  # type: ignore[union-attr]
@@ -278,6 +278,9 @@ class Arrays(Everywhere):
 
     def material(self, label) -> list:
         return list(jnp.moveaxis(self.tables.materials[label], -1, 0))  # type: ignore[index]
+
+    def body(self, label) -> list:
+        return list(jnp.moveaxis(self.tables.bodies[label], -1, 0))  # type: ignore[index]
 
     def bent(self, place) -> list:
         return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]

@@ -21,7 +21,7 @@ from whill_mjx.world.render import culling, visibility
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
 from whill_mjx.world.render.rectangles import CHUNK, Kind, Listed, Numbers, listed
-from whill_mjx.world.render.rich import CASTER, NUMBERS, caster_factor, caster_reach
+from whill_mjx.world.render.rich import BODY, CASTER, NUMBERS, caster_factor, caster_reach
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
 from whill_mjx.world.render.tables import lit_words, make_tables, parts_of, row_numbers
 from whill_mjx.world.render.textures import whole
@@ -69,13 +69,14 @@ class Inputs:
 
     floats: Any  # numbers of the view
     integers: Any  # (2,) seed, and whether the pose is finite
-    words: Any  # (labels * 4,)
+    words: Any  # (labels * 4,), or None
     dark: Any
     rows: Any  # lines of `row_numbers`, as `_flat` lays them
     bent: Any  # of 8
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
     materials: Any = None  # of NUMBERS; None without rich looks
+    bodies: Any = None  # of BODY
 
 
 class Tile(NamedTuple):
@@ -214,10 +215,9 @@ def _inputs(
 
     atlas = None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.reshape(-1)
     dark = None if tables.dark is None else tables.dark.reshape(-1)
-    rows = None if lit_words(scene) else _flat(tables.rows)
-    bent, materials = _flat(tables.bent), _flat(tables.materials)
-    floats, words = jnp.concatenate(flat), tables.words.reshape(-1)
-    return Inputs(floats, integers, words, dark, rows, bent, atlas, lists, materials), rebuild
+    words = None if tables.words is None else tables.words.reshape(-1)
+    rows, bent, materials, bodies = map(_flat, (tables.rows, tables.bent, tables.materials, tables.bodies))
+    return Inputs(jnp.concatenate(flat), integers, words, dark, rows, bent, atlas, lists, materials, bodies), rebuild
 
 
 def _first_labels(scene: Scene) -> dict[str, int]:
@@ -407,6 +407,9 @@ class Refs:
 
     def material(self, label) -> list:
         return _line(self.data.materials, label, NUMBERS)
+
+    def body(self, label) -> list:
+        return _line(self.data.bodies, label, BODY)
 
     def bent(self, place) -> list:
         return _line(self.data.bent, place, 8)

@@ -13,10 +13,14 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.world.render.textures import random_cell, smooth_noise
-from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
+from whill_mjx.world.render.visibility import GROUND, Rays
 
 NUMBERS = 27
 """Numbers of a material in the table."""
+BODY = 11
+"""Numbers of a box or a round in the table."""
+TOP_FACE = 2
+"""The face across a box's third axis; the ground shows it."""
 CASTER = 10
 """Numbers of a thing that throws a soft shadow."""
 NEAR_SHADOW, FAR_SHADOW = 0.06, 0.35
@@ -43,14 +47,14 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     lights, seed, seen = view.lights, view.looks.seed, hit.seen
     depth = jnp.where(seen, hit.depth, 0.0)
     point = [view.position[i] + depth * way for i, way in enumerate((rays.x, rays.y, rays.z))]
-    code = jnp.where(hit.solid, hit.code, 4 * GROUND)
-    row, label = stage.row(code), code >> 2
+    code = jnp.where(hit.solid, hit.code, 4 * GROUND + TOP_FACE)
+    label = code >> 2
     m = stage.material(label)
-    normal = face_normal(row, *point)
+    normal, s, t, toward = stage.settle(_face(stage.body(label), code & 3, point, rays))
     length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
-    facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
+    facing = toward * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
-    paint, tone = stage.settle(_paint(stage, Surface(row, m, label, point, pixel), seed))
+    paint, tone = stage.settle(_paint(stage, Surface((s, t), m, label, point[2], pixel), seed))
     light = stage.settle(_light(lights, normal, point, stage))
     glossy = jnp.where(seen & (normal[2] > 0.9), m[25], 0.0)
     mirror = stage.where_some(glossy > 0.0, lambda: _mirror(lights, rays, point, facing), jnp.zeros_like(glossy))
@@ -65,21 +69,49 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     return colours
 
 
+def _face(body: list, face, point: list, rays: Rays) -> tuple:
+    """What a body shows at a point: its normal there, the place (s, t) on the face [m], and how far the ray goes into
+    it, as a share of the ray's length.
+
+    Pictures stand upright and unmirrored on the sides of an upright box: s runs to the right, and t up.
+
+    Args:
+        body: BODY numbers, see `tables.bodies`.
+        face: across the first, second or third axis of a box; of a round 0 is its side and 2 a flat end.
+        point: x, y, z in the world [m].
+        rays: that meet it.
+    """
+    one, other = body[:3], body[3:6]
+    axis = [one[1] * other[2] - one[2] * other[1], one[2] * other[0] - one[0] * other[2],
+            one[0] * other[1] - one[1] * other[0]]  # fmt: skip
+    away = [point[i] - body[6 + i] for i in range(3)]
+    x, y, z = (sum(way[i] * away[i] for i in range(3)) for way in (one, other, axis))
+    is_round, first, second = body[10] > 0.0, face == 0, face == 1
+    along = jnp.minimum(jnp.maximum(z, -body[9]), body[9])
+    normal = []
+    for i in range(3):
+        side = jnp.where(is_round, (away[i] - along * axis[i]) * body[10], one[i])
+        normal.append(jnp.where(first, side, jnp.where(second, other[i], axis[i])))
+    into = normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z
+    sign = jnp.where(into > 0.0, -1.0, 1.0)
+    s = jnp.where(is_round, x, jnp.where(first, y * sign, jnp.where(second, -x * sign, x)))
+    t = jnp.where(is_round | first | second, z, y)
+    return [value * sign for value in normal], s, t, jnp.abs(into)
+
+
 class Surface(NamedTuple):
     """Where rays meet a surface, and what it is made of."""
 
-    row: list  # numbers of the face
+    place: tuple  # s, t on the face [m]
     material: list  # NUMBERS of them, see `material_table`
     label: jax.Array
-    point: list  # x, y, z in the world [m]
+    height: jax.Array  # above the floor [m]
     pixel: jax.Array  # size of a pixel on it [m]
 
 
 def _paint(stage: Any, surface: Surface, seed: jax.Array) -> tuple[list, jax.Array]:
     """Reflectance of a surface, and the factor on it of cells, joints, blotches and grain."""
-    row, m, label, (x, y, z), pixel = surface
-    s = row[8] * x + row[9] * y + row[10] * z + row[11]
-    t = row[12] * x + row[13] * y + row[14] * z + row[15]
+    (s, t), m, label, z, pixel = surface
     own = stage.small(label.astype(jnp.uint32)) * 17.0
     b = t * m[10] + 0.37
     line = stage.floor(b)

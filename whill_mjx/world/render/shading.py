@@ -119,6 +119,9 @@ class Stage(Protocol):
     def material(self, label) -> list:
         """Numbers of a label's material: see `render.rich`."""
 
+    def body(self, label) -> list:
+        """Numbers of a label's body: see `tables.bodies`."""
+
     def bent(self, place) -> list:
         """Numbers of a face of a round, by its code less `first_bent`: see `tables.bent_rows`."""
 

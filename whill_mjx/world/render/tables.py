@@ -85,7 +85,7 @@ class Tables:
     upright: jax.Array  # (P, 12)
     block: jax.Array | None  # (K, 15)
     round: jax.Array | None  # (K, 12)
-    words: jax.Array  # (labels, 4) uint32 colour of each face
+    words: jax.Array | None  # (labels, 4) uint32 colour of each face; None with rich looks
     dark: jax.Array | None  # (labels, 4) uint32 colour of each face in shadow
     bent: jax.Array | None  # (K * 4, 8) geometry of each face of the rounds, whose words hold no light
     rows: jax.Array | None  # (labels * 4, row_numbers) geometry and texture of each face
@@ -93,12 +93,13 @@ class Tables:
     block_shadow: jax.Array | None  # (K, 18)
     round_shadow: jax.Array | None  # (K, 13)
     materials: jax.Array | None = None  # (labels, NUMBERS) of rich looks
+    bodies: jax.Array | None = None  # (labels, BODY) of rich looks
 
 
 def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: bool = False) -> Tables:
     """Tables of one image; `rows` also when the light does not need them."""
-    lit = lit_words(scene)
-    words, dark = face_words(view.position, parts, scene.looks, lit)
+    lit, rich = lit_words(scene), scene.rich
+    words, dark = (None, None) if rich is not None else face_words(view.position, parts, scene.looks, lit)
     sun = scene.looks.sun
     blocks, rounds = parts.blocks, parts.rounds
     return Tables(
@@ -108,11 +109,12 @@ def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: boo
         words,
         dark if shadows and lit else None,
         bent_rows(view.position, rounds).reshape(-1, 8) if rounds is not None and lit else None,
-        face_rows(view.position, parts, scene) if rows or not lit else None,
+        face_rows(view.position, parts, scene) if rows or not (lit or rich is not None) else None,
         upright_shadow_table(sun, parts.boxes) if shadows else None,
         block_shadow_table(sun, blocks) if shadows and blocks is not None else None,
         round_shadow_table(sun, rounds) if shadows and rounds is not None else None,
-        None if scene.rich is None else material_table(scene.rich.materials),
+        None if rich is None else material_table(rich.materials),
+        None if rich is None else bodies(parts),
     )
 
 
@@ -222,6 +224,26 @@ def _round_rows(position, rounds: Rounds, scale) -> jax.Array:
     maps = jnp.concatenate([part * factor for pair in zip((aside, axis), offsets, strict=True) for part in pair], 1)
     maps = jnp.broadcast_to(maps[:, None], (maps.shape[0], 4, 8))
     return jnp.concatenate([bent_rows(position, rounds), maps], 2)
+
+
+def bodies(parts: Parts) -> jax.Array:
+    """(labels, BODY) numbers of what has rich looks: a line each, where `face_rows` has four of 16.
+
+    0-2 and 3-5 two axes square to each other; 6-8 centre, 9 half length and 10 inverse radius of
+    a round, whose axis is the third one; 0 for boxes.
+    """
+    sky = ground = jnp.array([[1.0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0]])
+    boxes = parts.boxes
+    c, s, zero = jnp.cos(boxes.yaw)[:, None], jnp.sin(boxes.yaw)[:, None], jnp.zeros((boxes.yaw.shape[0], 1))
+    rows = [sky, ground, jnp.concatenate([c, s, zero, -s, c, zero, boxes.centre, zero, zero], 1)]
+    if parts.blocks is not None:
+        blocks, flat = parts.blocks, jnp.zeros((parts.blocks.mask.shape[0], 2))
+        rows.append(jnp.concatenate([blocks.rotation[:, :, 0], blocks.rotation[:, :, 1], blocks.centre, flat], 1))
+    if parts.rounds is not None:
+        rounds = parts.rounds
+        aside, bend = across(rounds.axis), jnp.stack([rounds.half, 1.0 / jnp.maximum(rounds.radius, 1e-6)], 1)
+        rows.append(jnp.concatenate([aside, jnp.cross(rounds.axis, aside), rounds.centre, bend], 1))
+    return jnp.concatenate(rows)
 
 
 def bent_rows(position: jax.Array, rounds: Rounds) -> jax.Array:
