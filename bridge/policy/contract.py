@@ -28,7 +28,7 @@ MAX_CARRY = 64
 MAX_STATE_BYTES = 16 * MIB
 """Largest recurrent state [bytes]: it is copied in every step. Presets have less than 100 kB."""
 SURPRISE = "surprise"
-"""Name of the carry that holds a running mean of how little the images agree with what was expected [nat]."""
+"""Name of the carry that holds a running mean of how far the goal that the policy believes in jumps [m]."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Contract:
     vehicle_sha256: str
     """Of the vehicle file that it was trained with."""
     novelty: tuple[float, float] | None = None
-    """Surprise [nat] from which the vehicle slows down, and at which it stops; None where the file has no score."""
+    """Surprise [m] from which the vehicle slows down, and at which it stops; None where the file has no score."""
 
     @property
     def commands(self) -> "Commands":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Callable
@@ -98,7 +99,7 @@ class Log:
         if not parallel.is_first_process():
             return
         with self._path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(text_of(line))
         if self._board is not None:
             self._board.write(line, pretrain.position(self._config, line))
         if self._on_metrics is not None:
@@ -108,6 +109,11 @@ class Log:
         """Close the curves."""
         if self._board is not None:
             self._board.close()
+
+
+def text_of(line: dict[str, float]) -> str:
+    """A line of metrics.jsonl. JSON has no sign for NaN and infinities, so a figure that is one is left out."""
+    return json.dumps({name: value for name, value in line.items() if math.isfinite(value)}) + "\n"
 
 
 def named_figures(figures: Any) -> dict[str, float]:

@@ -79,6 +79,13 @@ def test_damaged_lines_of_a_log_are_left_out(data, tmp_path_factory):
     assert json.loads(path.read_text().splitlines()[-1]) == {"env_steps": 30.0}
 
 
+def test_a_figure_that_json_cannot_say_is_left_out_of_its_line(tmp_path):
+    log = Log(tmp_path / "metrics.jsonl", tiny_config(), 0, None, False)
+    log.write({"env_steps": 30, "loss": float("nan"), "eval/return": float("-inf"), "grad_norm": 2.5})
+    assert log.last["grad_norm"] == 2.5
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"env_steps": 30, "grad_norm": 2.5}\n'
+
+
 @pytest.mark.parametrize("every_s, took_s, expected_s", [
     (None, 0.5, 60.0), (None, 30.0, 570.0), (5.0, 30.0, 5.0), (0.0, 30.0, 0.0),
 ])  # fmt: skip

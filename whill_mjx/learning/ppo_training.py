@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from concurrent.futures import wait
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 
 from dreamer.train import COMPILING, TrainingOptions, carry_out, copied
 from dreamer.training import checkpoint
+from dreamer.training.metrics_log import text_of
 from dreamer.training.programs import compiled, in_thread
 from dreamer.training.progress import Progress
 from whill_mjx.io.folders import write_whole
@@ -167,7 +167,7 @@ class _Run:
             figures = self.options.eval_fn(self.state.params, self.env_steps)
             line |= {f"eval/{name}": value for name, value in figures.items()}
         with (self.out / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(text_of(line))
         if self.options.on_metrics is not None:
             self.options.on_metrics(line)
         return line
