@@ -142,7 +142,8 @@ def _check_parameters(folder: Path, arrays: dict[str, np.ndarray], seeds: int) -
     finite = {name: np.isfinite(array.astype(np.float32)).reshape(seeds or 1, -1).all(1)
               for name, array in found.items()}  # fmt: skip
     wrong = [name for name, each in finite.items() if not each.all()]
-    if wrong and not np.all(list(finite.values()), axis=0).any():
+    good = np.all(list(finite.values()), axis=0)
+    if wrong and not good.any():
         there = ", ".join(path.name for path in complete(folder)) or "none"
         raise CheckpointError(
             f"{folder}: {len(wrong)} of {len(found)} arrays of parameters hold values that are no finite numbers (such "
@@ -150,6 +151,11 @@ def _check_parameters(folder: Path, arrays: dict[str, np.ndarray], seeds: int) -
             "the environment that are NaN, infinite or very large, or lower the learning rate, and start in a new "
             f"folder. Checkpoints from before, here: {there}."
         )
+    if wrong:
+        lost = ", ".join(str(place) for place in np.flatnonzero(~good))
+        warnings.warn(f"{folder}: the training has diverged for {int((~good).sum())} of {seeds} seeds, at the places "
+                      f"{lost} counted from 0; its arrays {wrong[0]} and others are no finite numbers. The other seeds "
+                      "go on. Leave these out of what you compare.", stacklevel=2)
 
 
 @contextmanager

@@ -156,11 +156,12 @@ def test_a_network_that_has_diverged_replaces_no_checkpoint(value, tmp_path):
     assert [kept] == list(tmp_path.iterdir())
 
 
-def test_one_diverged_seed_of_several_ends_no_training(tmp_path):
+def test_one_diverged_seed_of_several_ends_no_training_but_is_told(tmp_path):
     def state(*values):
         return {"agent": {"params": {"w": np.array([[1, value] for value in values], np.float32)}}}
 
-    assert checkpoint.save(tmp_path, state(1, np.nan), CONFIG, checkpoint.Moment(10), seeds=2).exists()
+    with pytest.warns(UserWarning, match="diverged for 1 of 3 seeds, at the places 1 counted from 0.*agent.params.w"):
+        assert checkpoint.save(tmp_path, state(1, np.nan, 2), CONFIG, checkpoint.Moment(10), seeds=3).exists()
     with pytest.raises(checkpoint.CheckpointError, match="diverged"):
         checkpoint.save(tmp_path, state(INF, np.nan), CONFIG, checkpoint.Moment(20), seeds=2)
 
