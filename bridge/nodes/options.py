@@ -57,6 +57,10 @@ class WithDefaults(argparse.HelpFormatter):
         return f"{text} (default: {' '.join(str(value).replace('%', '%%') for value in values)})"
 
 
+class LeftOut(str):
+    """An option that keeps its default, as a ROS parameter that is false says; the parser refuses a name it lacks."""
+
+
 class Parser(argparse.ArgumentParser):
     """An `argparse.ArgumentParser` whose complaint is one line, without the usage; it takes no empty words.
 
@@ -76,6 +80,10 @@ class Parser(argparse.ArgumentParser):
         """Refuse an empty word, which as a path would be the folder that the command is called in; a path whose ~ the
         shell has left as it is; and an option that is given again, where only the last one would count."""
         words = sys.argv[1:] if args is None else list(args)
+        known = {name for one in self._actions for name in one.option_strings}
+        if missing := [word for word in words if isinstance(word, LeftOut) and word not in known]:
+            self.error(f"unrecognized arguments: {' '.join(missing)}")
+        words = [word for word in words if not isinstance(word, LeftOut)]
         repeatable = {name for one in self._actions if isinstance(one, argparse._AppendAction)
                       for name in one.option_strings}
         names = [word.partition("=")[0] for word in words if word.startswith("--") and word != "--"]

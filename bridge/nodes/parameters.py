@@ -12,6 +12,7 @@ from typing import Any
 
 from bridge.nodes import ros
 from bridge.nodes.exits import Exit
+from bridge.nodes.options import LeftOut
 
 LARGEST = 100_000
 """Bytes of a parameter file; those of the bridge have 2 kB."""
@@ -192,10 +193,12 @@ def _is_plain(value: Any) -> bool:
 
 
 def _option(name: str, value: Any) -> Iterator[str]:
-    """Yield the words of one option; false and empty values leave the default."""
+    """Yield the words of one option; false and empty values leave the default, of an option that there is."""
+    option = "--" + str(name).replace("_", "-")
     if value is False or value is None or value == "":
+        yield LeftOut(option)
         return
-    yield "--" + str(name).replace("_", "-")
+    yield option
     if value is not True:
         yield from (str(item) for item in (value if isinstance(value, list) else [value]))
 

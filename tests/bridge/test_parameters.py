@@ -43,9 +43,16 @@ def test_later_parameters_and_the_command_line_win(tmp_path):
     assert parsed.stamp_age == float("inf")
 
 
-def test_parameter_that_is_no_option_is_refused():
+@pytest.mark.parametrize("value", ["1", "false", "''", "null"])
+def test_parameter_that_is_no_option_is_refused(value, capsys):
     with pytest.raises(SystemExit):
-        options(["--ros-args", "-p", "policy:=a", "-p", "no_such_option:=1"])
+        options(["--ros-args", "-p", "policy:=a", "-p", f"no_such_option:={value}"])
+    assert "--no-such-option" in capsys.readouterr().err
+
+
+def test_an_option_whose_parameter_is_false_or_empty_keeps_its_default():
+    given = ["--ros-args", "-p", "policy:=a", "-p", "realtime:=false", "-p", "v_limits:=null"]
+    assert options(given) == options(["--ros-args", "-p", "policy:=a"])
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "a: [", "3"])
