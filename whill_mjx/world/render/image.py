@@ -30,7 +30,7 @@ from whill_mjx.world.render.culling import (
     upright_body,
     upright_bounds,
 )
-from whill_mjx.world.render.rich import Everywhere
+from whill_mjx.world.render.rich import Everywhere, with_third_axis
 from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
 from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal, larger, smaller
@@ -280,7 +280,8 @@ class Arrays(Everywhere):
         return list(jnp.moveaxis(self.tables.materials[label], -1, 0))  # type: ignore[index]
 
     def body(self, label) -> list:
-        return list(jnp.moveaxis(self.tables.bodies[label], -1, 0))  # type: ignore[index]
+        whole = jnp.stack(with_third_axis(list(self.tables.bodies.T)), -1)  # type: ignore[union-attr]
+        return list(jnp.moveaxis(whole[label], -1, 0))
 
     def bent(self, place) -> list:
         return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]

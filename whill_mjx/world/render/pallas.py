@@ -21,7 +21,7 @@ from whill_mjx.world.render import culling, visibility
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
 from whill_mjx.world.render.rectangles import CHUNK, Kind, Listed, Numbers, listed
-from whill_mjx.world.render.rich import BODY, CASTER, NUMBERS, caster_factor, caster_reach
+from whill_mjx.world.render.rich import BODY, CASTER, NUMBERS, caster_factor, caster_reach, with_third_axis
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
 from whill_mjx.world.render.tables import lit_words, make_tables, parts_of, row_numbers
 from whill_mjx.world.render.textures import whole
@@ -409,7 +409,7 @@ class Refs:
         return _line(self.data.materials, label, NUMBERS)
 
     def body(self, label) -> list:
-        return _line(self.data.bodies, label, BODY)
+        return with_third_axis(_line(self.data.bodies, label, BODY))
 
     def bent(self, place) -> list:
         return _line(self.data.bent, place, 8)

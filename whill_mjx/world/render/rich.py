@@ -50,7 +50,7 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     code = jnp.where(hit.solid, hit.code, 4 * GROUND + TOP_FACE)
     label = code >> 2
     m = stage.material(label)
-    normal, s, t, toward = stage.settle(_face(stage.body(label), code & 3, point, rays))
+    normal, s, t, toward = _face(stage.body(label), code & 3, point, rays)
     length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
     facing = toward * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
@@ -76,14 +76,12 @@ def _face(body: list, face, point: list, rays: Rays) -> tuple:
     Pictures stand upright and unmirrored on the sides of an upright box: s runs to the right, and t up.
 
     Args:
-        body: BODY numbers, see `tables.bodies`.
+        body: BODY numbers, see `tables.bodies`, and the third axis.
         face: across the first, second or third axis of a box; of a round 0 is its side and 2 a flat end.
         point: x, y, z in the world [m].
         rays: that meet it.
     """
-    one, other = body[:3], body[3:6]
-    axis = [one[1] * other[2] - one[2] * other[1], one[2] * other[0] - one[0] * other[2],
-            one[0] * other[1] - one[1] * other[0]]  # fmt: skip
+    one, other, axis = body[:3], body[3:6], body[BODY:]
     away = [point[i] - body[6 + i] for i in range(3)]
     x, y, z = (sum(way[i] * away[i] for i in range(3)) for way in (one, other, axis))
     is_round, first, second = body[10] > 0.0, face == 0, face == 1
@@ -97,6 +95,12 @@ def _face(body: list, face, point: list, rays: Rays) -> tuple:
     s = jnp.where(is_round, x, jnp.where(first, y * sign, jnp.where(second, -x * sign, x)))
     t = jnp.where(is_round | first | second, z, y)
     return [value * sign for value in normal], s, t, jnp.abs(into)
+
+
+def with_third_axis(body: list) -> list:
+    """BODY numbers, and the axis square to the two that they hold."""
+    (a, b, c), (d, e, f) = body[:3], body[3:6]
+    return [*body, b * f - c * e, c * d - a * f, a * e - b * d]
 
 
 class Surface(NamedTuple):
