@@ -1,9 +1,23 @@
 """Thin ROS 2 bridge: runs a policy file on the vehicle, and the simulator behind the same topics."""
 
 import os
-import signal
 import sys
-from types import FrameType
+
+
+def _look_last_in_the_current_folder() -> None:
+    """Of a command: a user's json.py or queue.py must not stand for Python's own."""
+    try:
+        here, source = os.getcwd(), os.path.join(os.path.dirname(__file__), os.pardir)
+        if sys.argv[:1] == ["-m"] and sys.path[:1] == [here] and not os.path.samefile(here, source):
+            sys.path.append(sys.path.pop(0))
+    except OSError:  # the folder is gone
+        pass
+
+
+_look_last_in_the_current_folder()
+
+import signal  # noqa: E402
+from types import FrameType  # noqa: E402
 
 COMMANDS = ("drive", "guard", "manoeuvre", "record", "simulate", "chair", "chair_joy")
 

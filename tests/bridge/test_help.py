@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -34,3 +36,11 @@ def test_help_shows_defaults_once(module, shown, capsys, monkeypatch):
     text = capsys.readouterr().out
     assert all(one in text for one in shown)
     assert not any(line.count("default") > 1 or "inf inf" in line for line in text.splitlines())
+
+
+def test_a_command_takes_no_module_of_python_from_the_folder_it_is_called_in(tmp_path):
+    for name in ("json", "queue", "signal"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('of the user')\n")
+    words = [sys.executable, "-m", "bridge.guard", "--help"]
+    answer = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
+    assert answer.returncode == 0 and answer.stdout.startswith("usage: python -m bridge.guard ")
