@@ -5,7 +5,8 @@ import sys
 
 
 def _look_last_in_the_current_folder() -> None:
-    """Of a command: a user's json.py or queue.py must not stand for Python's own."""
+    """Of a command: a user's json.py or queue.py must not stand for Python's own. As in `whill_mjx`, without which this
+    package is installed on a robot; and nothing can be imported before it."""
     try:
         here, source = os.getcwd(), os.path.join(os.path.dirname(__file__), os.pardir)
         if sys.argv[:1] == ["-m"] and sys.path[:1] == [here] and not os.path.samefile(here, source):

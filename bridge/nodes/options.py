@@ -80,8 +80,8 @@ class Parser(argparse.ArgumentParser):
         """Refuse an empty word, which as a path would be the folder that the command is called in; a path whose ~ the
         shell has left as it is; and an option that is given again, where only the last one would count."""
         words = sys.argv[1:] if args is None else list(args)
-        known = {name for one in self._actions for name in one.option_strings}
-        if missing := [word for word in words if isinstance(word, LeftOut) and word not in known]:
+        left_out = [word for word in words if isinstance(word, LeftOut)]
+        if missing := [word for word in left_out if word not in self._option_string_actions]:
             self.error(f"unrecognized arguments: {' '.join(missing)}")
         words = [word for word in words if not isinstance(word, LeftOut)]
         repeatable = {name for one in self._actions if isinstance(one, argparse._AppendAction)

@@ -153,9 +153,9 @@ def _check_parameters(folder: Path, arrays: dict[str, np.ndarray], seeds: int) -
         )
     if wrong:
         lost = ", ".join(str(place) for place in np.flatnonzero(~good))
-        warnings.warn(f"{folder}: the training has diverged for {int((~good).sum())} of {seeds} seeds, at the places "
-                      f"{lost} counted from 0; its arrays {wrong[0]} and others are no finite numbers. The other seeds "
-                      "go on. Leave these out of what you compare.", stacklevel=2)
+        warnings.warn(f"{folder}: the training has diverged for {int((~good).sum())} of {seeds} seeds (places {lost}, "
+                      f"counted from 0): {wrong[0]}, say, holds values that are no finite numbers. The other seeds go "
+                      "on. Leave these out of what you compare.", stacklevel=2)
 
 
 @contextmanager

@@ -160,7 +160,7 @@ def test_one_diverged_seed_of_several_ends_no_training_but_is_told(tmp_path):
     def state(*values):
         return {"agent": {"params": {"w": np.array([[1, value] for value in values], np.float32)}}}
 
-    with pytest.warns(UserWarning, match="diverged for 1 of 3 seeds, at the places 1 counted from 0.*agent.params.w"):
+    with pytest.warns(UserWarning, match=r"diverged for 1 of 3 seeds \(places 1, counted from 0\): agent.params.w"):
         assert checkpoint.save(tmp_path, state(1, np.nan, 2), CONFIG, checkpoint.Moment(10), seeds=3).exists()
     with pytest.raises(checkpoint.CheckpointError, match="diverged"):
         checkpoint.save(tmp_path, state(INF, np.nan), CONFIG, checkpoint.Moment(20), seeds=2)

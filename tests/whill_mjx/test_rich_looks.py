@@ -14,9 +14,12 @@ from whill_mjx.world.eye import develop, plain_eye
 from whill_mjx.world.paint import paint
 from whill_mjx.world.render import camera_rotation, pinhole, render
 from whill_mjx.world.render.pallas import Tiling, fast_floor, fast_whole, render_pallas
-from whill_mjx.world.render.rich import NUMBERS, Surface, _paint
+from whill_mjx.world.render.rich import NUMBERS, Surface, _face, _paint, with_third_axis
+from whill_mjx.world.render.tables import bodies, face_rows, parts_of
 from whill_mjx.world.render.textures import whole
+from whill_mjx.world.render.visibility import GROUND, face_normal
 from whill_mjx.world.rich import FLOOR, MARKER, PASSAGE, furnish, roles_of
+from whill_mjx.world.solids import Blocks, Rounds, Solids
 
 SIZE = 16
 
@@ -162,3 +165,33 @@ def test_a_plain_eye_leaves_an_image_as_it_is():
     image = jax.random.randint(jax.random.key(0), (SIZE, SIZE, 3), 0, 120).astype(jnp.uint8)
     sent = develop(image, plain_eye(), jnp.zeros(()), jax.random.key(1), jnp.array(0))
     assert np.abs(np.asarray(sent, int) - image).max() <= 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_face_found_from_its_body_is_that_of_the_table_of_faces(seed):
+    """Boxes, blocks and rounds of any turn, and the ground, met from outside: normal, and place on the face."""
+    rng, count = np.random.default_rng(seed), 5
+    scene = furnished("corridor", jax.random.key(seed))
+    turns, axes = (np.linalg.qr(rng.normal(size=(count, 3, 3)))[0] for _ in range(2))
+    turns *= np.linalg.det(turns)[:, None, None]  # turned, and not mirrored
+    centre, half = rng.uniform(-2, 2, (2, count, 3)), rng.uniform(0.1, 0.5, (count, 3))
+    white, on = jnp.ones((count, 3)), jnp.ones(count, bool)
+    rounds = Rounds(jnp.asarray(centre[0]), jnp.asarray(axes[:, 0]), half[:, 0], half[:, 1], ~on, white, on)
+    blocks = Blocks(jnp.asarray(centre[1]), half, jnp.asarray(turns), white, on)
+    parts = parts_of(dataclasses.replace(scene, solids=Solids(blocks=blocks, rounds=rounds)))
+    eye, point = rng.uniform(-3, 3, 3), jnp.asarray(rng.uniform(-3, 3, (3, parts.labels)))
+    rows, body = face_rows(eye, parts, scene), with_third_axis(list(bodies(parts).T))
+    for face in range(3):
+        code = 4 * np.arange(parts.labels) + face
+        row = list(rows[code].T)
+        normal = jnp.stack(face_normal(row, *point))
+        place = [row[first] * point[0] + row[first + 1] * point[1] + row[first + 2] * point[2] + row[first + 3]
+                 for first in (8, 12)]  # fmt: skip
+        ray = SimpleNamespace(x=-normal[0], y=-normal[1], z=-normal[2])  # straight on what is turned to the eye
+        shown = np.arange(parts.labels) > GROUND if face < 2 else np.arange(parts.labels) >= GROUND
+        if face == 1:
+            shown &= np.arange(parts.labels) < parts.first_round  # rounds have a side and ends
+        found, *there, across = _face(body, face, list(point), ray)
+        np.testing.assert_allclose(jnp.stack(found)[:, shown], normal[:, shown], atol=2e-5)
+        np.testing.assert_allclose(jnp.stack(there)[:, shown], jnp.stack(place)[:, shown], atol=2e-5)
+        np.testing.assert_allclose(across[shown], jnp.sum(normal**2, 0)[shown], atol=2e-5)

@@ -182,6 +182,9 @@ def _stage(view: View, scene: Scene, quality: Quality, rows: bool = False) -> Ar
     """What every pixel meets."""
     parts = parts_of(scene)
     tables = make_tables(view, parts, scene, quality.shadows, rows)
+    if tables.bodies is not None:
+        whole = jnp.stack(with_third_axis(list(tables.bodies.T)), -1)
+        tables = tables.replace(bodies=whole)  # type: ignore[attr-defined]
     # The barrier keeps XLA from computing the numbers of a box again in every pixel.
     tables = jax.lax.optimization_barrier(tables)
     lists = None
@@ -280,8 +283,7 @@ class Arrays(Everywhere):
         return list(jnp.moveaxis(self.tables.materials[label], -1, 0))  # type: ignore[index]
 
     def body(self, label) -> list:
-        whole = jnp.stack(with_third_axis(list(self.tables.bodies.T)), -1)  # type: ignore[union-attr]
-        return list(jnp.moveaxis(whole[label], -1, 0))
+        return list(jnp.moveaxis(self.tables.bodies[label], -1, 0))  # type: ignore[index]
 
     def bent(self, place) -> list:
         return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]

@@ -70,10 +70,10 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
 
 
 def _face(body: list, face, point: list, rays: Rays) -> tuple:
-    """What a body shows at a point: its normal there, the place (s, t) on the face [m], and how far the ray goes into
-    it, as a share of the ray's length.
+    """What a body shows at a point: its normal there, the place (s, t) on the face [m], and how much of the ray, in
+    its own length, runs across the face.
 
-    Pictures stand upright and unmirrored on the sides of an upright box: s runs to the right, and t up.
+    As `tables.face_rows` has them: s runs to the right on the sides of an upright box, and t up.
 
     Args:
         body: BODY numbers, see `tables.bodies`, and the third axis.

@@ -109,7 +109,7 @@ def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: boo
         words,
         dark if shadows and lit else None,
         bent_rows(view.position, rounds).reshape(-1, 8) if rounds is not None and lit else None,
-        face_rows(view.position, parts, scene) if rows or not (lit or rich is not None) else None,
+        face_rows(view.position, parts, scene) if rows or scene.finish is not None and rich is None else None,
         upright_shadow_table(sun, parts.boxes) if shadows else None,
         block_shadow_table(sun, blocks) if shadows and blocks is not None else None,
         round_shadow_table(sun, rounds) if shadows and rounds is not None else None,
@@ -229,8 +229,8 @@ def _round_rows(position, rounds: Rounds, scale) -> jax.Array:
 def bodies(parts: Parts) -> jax.Array:
     """(labels, BODY) numbers of what has rich looks: a line each, where `face_rows` has four of 16.
 
-    0-2 and 3-5 two axes square to each other; 6-8 centre, 9 half length and 10 inverse radius of
-    a round, whose axis is the third one; 0 for boxes.
+    0-2 and 3-5 two axes square to each other; 6-8 centre, 9 half length and 10 inverse radius of a round, whose axis is
+    the third one; 0 for boxes.
     """
     sky = ground = jnp.array([[1.0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0]])
     boxes = parts.boxes
