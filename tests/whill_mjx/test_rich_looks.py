@@ -14,10 +14,10 @@ from whill_mjx.world.eye import develop, plain_eye
 from whill_mjx.world.paint import paint
 from whill_mjx.world.render import camera_rotation, pinhole, render
 from whill_mjx.world.render.pallas import Tiling, fast_floor, fast_whole, render_pallas
-from whill_mjx.world.render.rich import NUMBERS, Surface, _face, _paint, with_third_axis
+from whill_mjx.world.render.rich import NUMBERS, Surface, _paint, face_of_body, face_of_row
 from whill_mjx.world.render.tables import bodies, face_rows, parts_of
 from whill_mjx.world.render.textures import whole
-from whill_mjx.world.render.visibility import GROUND, face_normal
+from whill_mjx.world.render.visibility import GROUND
 from whill_mjx.world.rich import FLOOR, MARKER, PASSAGE, furnish, roles_of
 from whill_mjx.world.solids import Blocks, Rounds, Solids
 
@@ -180,18 +180,15 @@ def test_a_face_found_from_its_body_is_that_of_the_table_of_faces(seed):
     blocks = Blocks(jnp.asarray(centre[1]), half, jnp.asarray(turns), white, on)
     parts = parts_of(dataclasses.replace(scene, solids=Solids(blocks=blocks, rounds=rounds)))
     eye, point = rng.uniform(-3, 3, 3), jnp.asarray(rng.uniform(-3, 3, (3, parts.labels)))
-    rows, body = face_rows(eye, parts, scene), with_third_axis(list(bodies(parts).T))
+    rows, body = face_rows(eye, parts, scene), list(bodies(parts).T)
     for face in range(3):
         code = 4 * np.arange(parts.labels) + face
-        row = list(rows[code].T)
-        normal = jnp.stack(face_normal(row, *point))
-        place = [row[first] * point[0] + row[first + 1] * point[1] + row[first + 2] * point[2] + row[first + 3]
-                 for first in (8, 12)]  # fmt: skip
+        normal, *place = face_of_row(list(rows[code].T), list(point))
+        normal = jnp.stack(normal)
         ray = SimpleNamespace(x=-normal[0], y=-normal[1], z=-normal[2])  # straight on what is turned to the eye
         shown = np.arange(parts.labels) > GROUND if face < 2 else np.arange(parts.labels) >= GROUND
         if face == 1:
             shown &= np.arange(parts.labels) < parts.first_round  # rounds have a side and ends
-        found, *there, across = _face(body, face, list(point), ray)
+        found, *there = face_of_body(body, face, list(point), ray)
         np.testing.assert_allclose(jnp.stack(found)[:, shown], normal[:, shown], atol=2e-5)
         np.testing.assert_allclose(jnp.stack(there)[:, shown], jnp.stack(place)[:, shown], atol=2e-5)
-        np.testing.assert_allclose(across[shown], jnp.sum(normal**2, 0)[shown], atol=2e-5)

@@ -30,7 +30,7 @@ from whill_mjx.world.render.culling import (
     upright_body,
     upright_bounds,
 )
-from whill_mjx.world.render.rich import Everywhere, with_third_axis
+from whill_mjx.world.render.rich import Everywhere, face_of_row
 from whill_mjx.world.render.shading import Quality, View, cast, pack_channels, pixel_colours, pixel_view
 from whill_mjx.world.render.tables import Parts, Tables, lit_words, make_tables, parts_of
 from whill_mjx.world.render.visibility import FAR, GROUND, MARKER, SKY, Rays, face_normal, larger, smaller
@@ -182,9 +182,6 @@ def _stage(view: View, scene: Scene, quality: Quality, rows: bool = False) -> Ar
     """What every pixel meets."""
     parts = parts_of(scene)
     tables = make_tables(view, parts, scene, quality.shadows, rows)
-    if tables.bodies is not None:
-        whole = jnp.stack(with_third_axis(list(tables.bodies.T)), -1)
-        tables = tables.replace(bodies=whole)  # type: ignore[attr-defined]
     # The barrier keeps XLA from computing the numbers of a box again in every pixel.
     tables = jax.lax.optimization_barrier(tables)
     lists = None
@@ -282,8 +279,8 @@ class Arrays(Everywhere):
     def material(self, label) -> list:
         return list(jnp.moveaxis(self.tables.materials[label], -1, 0))  # type: ignore[index]
 
-    def body(self, label) -> list:
-        return list(jnp.moveaxis(self.tables.bodies[label], -1, 0))  # type: ignore[index]
+    def face(self, code, point: list, rays: Rays) -> tuple:
+        return face_of_row(self.row(code), point)
 
     def bent(self, place) -> list:
         return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]

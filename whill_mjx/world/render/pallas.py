@@ -21,9 +21,9 @@ from whill_mjx.world.render import culling, visibility
 from whill_mjx.world.render.camera import Intrinsics, pixel_rays
 from whill_mjx.world.render.image import PLAIN, make_view, unpack_colours
 from whill_mjx.world.render.rectangles import CHUNK, Kind, Listed, Numbers, listed
-from whill_mjx.world.render.rich import BODY, CASTER, NUMBERS, caster_factor, caster_reach, with_third_axis
+from whill_mjx.world.render.rich import BODY, CASTER, NUMBERS, caster_factor, caster_reach, face_of_body
 from whill_mjx.world.render.shading import SAMPLES, Quality, View, pack_channels, pixel_colours
-from whill_mjx.world.render.tables import lit_words, make_tables, parts_of, row_numbers
+from whill_mjx.world.render.tables import bodies, lit_words, make_tables, parts_of, row_numbers
 from whill_mjx.world.render.textures import whole
 from whill_mjx.world.render.visibility import FAR, MARKER, Rays, key_of
 from whill_mjx.world.scene import Scene
@@ -76,7 +76,7 @@ class Inputs:
     atlas: Any  # (A * S * S,)
     kinds: dict[str, Listed]
     materials: Any = None  # of NUMBERS; None without rich looks
-    bodies: Any = None  # of BODY
+    bodies: Any = None  # of BODY, in place of rows
 
 
 class Tile(NamedTuple):
@@ -216,8 +216,10 @@ def _inputs(
     atlas = None if scene.finish is None or scene.finish.atlas is None else scene.finish.atlas.reshape(-1)
     dark = None if tables.dark is None else tables.dark.reshape(-1)
     words = None if tables.words is None else tables.words.reshape(-1)
-    rows, bent, materials, bodies = map(_flat, (tables.rows, tables.bent, tables.materials, tables.bodies))
-    return Inputs(jnp.concatenate(flat), integers, words, dark, rows, bent, atlas, lists, materials, bodies), rebuild
+    rows = None if scene.rich is not None else _flat(tables.rows)
+    own = None if scene.rich is None else _flat(bodies(parts))
+    bent, materials, floats = _flat(tables.bent), _flat(tables.materials), jnp.concatenate(flat)
+    return Inputs(floats, integers, words, dark, rows, bent, atlas, lists, materials, own), rebuild
 
 
 def _first_labels(scene: Scene) -> dict[str, int]:
@@ -408,8 +410,8 @@ class Refs:
     def material(self, label) -> list:
         return _line(self.data.materials, label, NUMBERS)
 
-    def body(self, label) -> list:
-        return with_third_axis(_line(self.data.bodies, label, BODY))
+    def face(self, code, point: list, rays: Rays) -> tuple:
+        return face_of_body(_line(self.data.bodies, code >> 2, BODY), code & 3, point, rays)
 
     def bent(self, place) -> list:
         return _line(self.data.bent, place, 8)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from whill_mjx.world.render.textures import random_cell, smooth_noise
-from whill_mjx.world.render.visibility import GROUND, Rays
+from whill_mjx.world.render.visibility import GROUND, Rays, face_normal
 
 NUMBERS = 27
 """Numbers of a material in the table."""
@@ -50,9 +50,9 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     code = jnp.where(hit.solid, hit.code, 4 * GROUND + TOP_FACE)
     label = code >> 2
     m = stage.material(label)
-    normal, s, t, toward = _face(stage.body(label), code & 3, point, rays)
+    normal, s, t = stage.face(code, point, rays)
     length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
-    facing = toward * length
+    facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
     paint, tone = stage.settle(_paint(stage, Surface((s, t), m, label, point[2], pixel), seed))
     light = stage.settle(_light(lights, normal, point, stage))
@@ -69,19 +69,25 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     return colours
 
 
-def _face(body: list, face, point: list, rays: Rays) -> tuple:
-    """What a body shows at a point: its normal there, the place (s, t) on the face [m], and how much of the ray, in
-    its own length, runs across the face.
+def face_of_row(row: list, point: list) -> tuple:
+    """Normal of a face at a point, and the place (s, t) on it [m], from its numbers in `tables.face_rows`."""
+    x, y, z = point
+    s, t = (row[i] * x + row[i + 1] * y + row[i + 2] * z + row[i + 3] for i in (8, 12))
+    return face_normal(row, x, y, z), s, t
 
-    As `tables.face_rows` has them: s runs to the right on the sides of an upright box, and t up.
+
+def face_of_body(body: list, face, point: list, rays: Rays) -> tuple:
+    """The same of a face that rays meet, from the BODY numbers of `tables.bodies`: a GPU writes fewer of them.
 
     Args:
-        body: BODY numbers, see `tables.bodies`, and the third axis.
+        body: of a box or a round.
         face: across the first, second or third axis of a box; of a round 0 is its side and 2 a flat end.
         point: x, y, z in the world [m].
-        rays: that meet it.
+        rays: that meet it there.
     """
-    one, other, axis = body[:3], body[3:6], body[BODY:]
+    one, other = body[:3], body[3:6]
+    axis = [one[1] * other[2] - one[2] * other[1], one[2] * other[0] - one[0] * other[2],
+            one[0] * other[1] - one[1] * other[0]]  # fmt: skip
     away = [point[i] - body[6 + i] for i in range(3)]
     x, y, z = (sum(way[i] * away[i] for i in range(3)) for way in (one, other, axis))
     is_round, first, second = body[10] > 0.0, face == 0, face == 1
@@ -90,17 +96,10 @@ def _face(body: list, face, point: list, rays: Rays) -> tuple:
     for i in range(3):
         side = jnp.where(is_round, (away[i] - along * axis[i]) * body[10], one[i])
         normal.append(jnp.where(first, side, jnp.where(second, other[i], axis[i])))
-    into = normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z
-    sign = jnp.where(into > 0.0, -1.0, 1.0)
+    sign = jnp.where(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z > 0.0, -1.0, 1.0)
     s = jnp.where(is_round, x, jnp.where(first, y * sign, jnp.where(second, -x * sign, x)))
     t = jnp.where(is_round | first | second, z, y)
-    return [value * sign for value in normal], s, t, jnp.abs(into)
-
-
-def with_third_axis(body: list) -> list:
-    """BODY numbers, and the axis square to the two that they hold."""
-    (a, b, c), (d, e, f) = body[:3], body[3:6]
-    return [*body, b * f - c * e, c * d - a * f, a * e - b * d]
+    return [value * sign for value in normal], s, t
 
 
 class Surface(NamedTuple):

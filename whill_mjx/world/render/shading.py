@@ -119,8 +119,8 @@ class Stage(Protocol):
     def material(self, label) -> list:
         """Numbers of a label's material: see `render.rich`."""
 
-    def body(self, label) -> list:
-        """Numbers of a label's body: see `tables.bodies`."""
+    def face(self, code, point: list, rays: Rays) -> tuple:
+        """Normal of a face where rays meet it, and the place s, t on it [m]."""
 
     def bent(self, place) -> list:
         """Numbers of a face of a round, by its code less `first_bent`: see `tables.bent_rows`."""

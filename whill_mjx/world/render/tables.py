@@ -93,7 +93,6 @@ class Tables:
     block_shadow: jax.Array | None  # (K, 18)
     round_shadow: jax.Array | None  # (K, 13)
     materials: jax.Array | None = None  # (labels, NUMBERS) of rich looks
-    bodies: jax.Array | None = None  # (labels, BODY) of rich looks
 
 
 def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: bool = False) -> Tables:
@@ -109,12 +108,11 @@ def make_tables(view: View, parts: Parts, scene: Scene, shadows: bool, rows: boo
         words,
         dark if shadows and lit else None,
         bent_rows(view.position, rounds).reshape(-1, 8) if rounds is not None and lit else None,
-        face_rows(view.position, parts, scene) if rows or scene.finish is not None and rich is None else None,
+        face_rows(view.position, parts, scene) if rows or not lit else None,
         upright_shadow_table(sun, parts.boxes) if shadows else None,
         block_shadow_table(sun, blocks) if shadows and blocks is not None else None,
         round_shadow_table(sun, rounds) if shadows and rounds is not None else None,
         None if rich is None else material_table(rich.materials),
-        None if rich is None else bodies(parts),
     )
 
 
