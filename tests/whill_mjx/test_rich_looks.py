@@ -183,9 +183,11 @@ def test_a_face_found_from_its_body_is_that_of_the_table_of_faces(seed):
     rows, body = face_rows(eye, parts, scene), list(bodies(parts).T)
     for face in range(3):
         code = 4 * np.arange(parts.labels) + face
-        normal, *place = face_of_row(list(rows[code].T), list(point))
-        normal = jnp.stack(normal)
-        ray = SimpleNamespace(x=-normal[0], y=-normal[1], z=-normal[2])  # straight on what is turned to the eye
+        way = rng.uniform(-1, 1, (3, parts.labels))
+        normal = jnp.stack(face_of_row(list(rows[code].T), list(point), SimpleNamespace(x=0.0, y=0.0, z=0.0))[0])
+        way *= -np.sign(jnp.sum(normal * way, 0))  # each ray meets the face that is turned to the eye
+        ray = SimpleNamespace(x=way[0], y=way[1], z=way[2])
+        _, *place = face_of_row(list(rows[code].T), list(point), ray)
         shown = np.arange(parts.labels) > GROUND if face < 2 else np.arange(parts.labels) >= GROUND
         if face == 1:
             shown &= np.arange(parts.labels) < parts.first_round  # rounds have a side and ends

@@ -280,7 +280,7 @@ class Arrays(Everywhere):
         return list(jnp.moveaxis(self.tables.materials[label], -1, 0))  # type: ignore[index]
 
     def face(self, code, point: list, rays: Rays) -> tuple:
-        return face_of_row(self.row(code), point)
+        return face_of_row(self.row(code), point, rays)
 
     def bent(self, place) -> list:
         return list(jnp.moveaxis(self.tables.bent[place], -1, 0))  # type: ignore[index]

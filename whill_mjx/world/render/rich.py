@@ -50,9 +50,9 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     code = jnp.where(hit.solid, hit.code, 4 * GROUND + TOP_FACE)
     label = code >> 2
     m = stage.material(label)
-    normal, s, t = stage.face(code, point, rays)
+    normal, s, t, toward = stage.face(code, point, rays)
     length = jax.lax.rsqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
-    facing = jnp.abs(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z) * length
+    facing = toward * length
     pixel = depth * (1.0 / view.intrinsics.fy) * jax.lax.rsqrt(jnp.maximum(facing, 0.05))  # m on the surface
     paint, tone = stage.settle(_paint(stage, Surface((s, t), m, label, point[2], pixel), seed))
     light = stage.settle(_light(lights, normal, point, stage))
@@ -69,15 +69,22 @@ def shade_rich(view: Any, stage: Any, rays: Rays, hit: Any) -> list:
     return colours
 
 
-def face_of_row(row: list, point: list) -> tuple:
-    """Normal of a face at a point, and the place (s, t) on it [m], from its numbers in `tables.face_rows`."""
+def face_of_row(row: list, point: list, rays: Rays) -> tuple:
+    """Normal of a face that rays meet at a point, the place s, t there [m], and how far a ray's direction goes into it;
+    from its numbers in `tables.face_rows`."""
     x, y, z = point
     s, t = (row[i] * x + row[i + 1] * y + row[i + 2] * z + row[i + 3] for i in (8, 12))
-    return face_normal(row, x, y, z), s, t
+    normal = face_normal(row, x, y, z)
+    return normal, s, t, jnp.abs(_into(normal, rays))
+
+
+def _into(normal: list, rays: Rays) -> jax.Array:
+    """How far the direction of each ray goes along a normal."""
+    return normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z
 
 
 def face_of_body(body: list, face, point: list, rays: Rays) -> tuple:
-    """The same of a face that rays meet, from the BODY numbers of `tables.bodies`: a GPU writes fewer of them.
+    """The same, from the BODY numbers of `tables.bodies`: a GPU writes fewer of them.
 
     Args:
         body: of a box or a round.
@@ -96,10 +103,11 @@ def face_of_body(body: list, face, point: list, rays: Rays) -> tuple:
     for i in range(3):
         side = jnp.where(is_round, (away[i] - along * axis[i]) * body[10], one[i])
         normal.append(jnp.where(first, side, jnp.where(second, other[i], axis[i])))
-    sign = jnp.where(normal[0] * rays.x + normal[1] * rays.y + normal[2] * rays.z > 0.0, -1.0, 1.0)
+    into = _into(normal, rays)
+    sign = jnp.where(into > 0.0, -1.0, 1.0)
     s = jnp.where(is_round, x, jnp.where(first, y * sign, jnp.where(second, -x * sign, x)))
     t = jnp.where(is_round | first | second, z, y)
-    return [value * sign for value in normal], s, t
+    return [value * sign for value in normal], s, t, jnp.abs(into)
 
 
 class Surface(NamedTuple):

@@ -120,7 +120,7 @@ class Stage(Protocol):
         """Numbers of a label's material: see `render.rich`."""
 
     def face(self, code, point: list, rays: Rays) -> tuple:
-        """Normal of a face where rays meet it, and the place s, t on it [m]."""
+        """Normal of a face where rays meet it, the place s, t on it [m], and how far a ray's direction goes into it."""
 
     def bent(self, place) -> list:
         """Numbers of a face of a round, by its code less `first_bent`: see `tables.bent_rows`."""
