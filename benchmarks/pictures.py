@@ -1,10 +1,11 @@
-"""Pictures of the pages: `python -m benchmarks.pictures drive`, `loop RUN`, `ros` or `map`; they go to docs/images/.
+"""Pictures of the pages: `python -m benchmarks.pictures drive`, `loop RUN`, `map`, ...; they go to docs/images/.
 
     drive      drive.webp: a planner drives the obstacle course; camera picture beside the world from above
     loop RUN   missing_effect.png: a verdict of `sysid.close_loop`, from RUN/report.json
     verdict FILE   verdict.svg: how a verdict was reached, from an evidence.json
     ros        ros2.png: which node publishes which topic
     map        map.png: a made map from above, and what a camera sees of its walls
+    foreign    foreign.png: what policies see of the foreign rooms; needs MUJOCO_GL=egl or osmesa without a display
 
 README's verdict is of drives of the contact plant, of which one tyre is 1.2 % larger than the other:
 
@@ -234,6 +235,30 @@ def office(out: Path) -> None:
     print(f"{out}: {len(made.walls.segments)} walls, {sheet.shape[1]} x {sheet.shape[0]}")
 
 
+def foreign(out: Path) -> None:
+    """First images of foreign rooms, four corridors beside four courses: plain, furnished and unseen."""
+    import cv2
+
+    from benchmarks.foreign.camera import Camera
+    from benchmarks.foreign.drive import Pose
+    from benchmarks.foreign.plan import PLANS
+    from benchmarks.foreign.room import VARIANTS, make_room
+    from benchmarks.foreign.run import MOUNT
+
+    def first(variant: str, seed: int, task: str) -> np.ndarray:
+        room = make_room(variant, seed, task)
+        camera = Camera(room.model, MOUNT, variant == "plain", np.random.default_rng(seed))
+        camera.place(Pose(*room.plan.start, 0.0, 0.0))
+        image = [camera.image(64) for _ in range(10)][-1]  # after a second of exposure control
+        camera.close()
+        large = cv2.resize(image, (128, 128), interpolation=cv2.INTER_NEAREST)
+        return np.pad(large[..., ::-1], ((2, 2), (2, 2), (0, 0)), constant_values=255)
+
+    rows = [np.hstack([first(variant, seed, task) for task in PLANS for seed in range(4)]) for variant in VARIANTS]
+    cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    print(f"{out}: {len(rows)} variants")
+
+
 def main() -> None:
     """Draw what the command line names."""
     parser = Parser(prog="python -m benchmarks.pictures", description=__doc__,
@@ -244,9 +269,12 @@ def main() -> None:
     kinds.add_parser("verdict", help="how it was reached").add_argument("file", type=Path, help="evidence.json")
     kinds.add_parser("ros", help="nodes and topics")
     kinds.add_parser("map", help="a map and its walls")
+    kinds.add_parser("foreign", help="rooms of the foreign simulator")
     given = parser.parse_args()
     if given.kind == "map":
         office(IMAGES / "map.png")
+    elif given.kind == "foreign":
+        foreign(IMAGES / "foreign.png")
     elif given.kind == "drive":
         drive(IMAGES / "drive.webp")
     elif given.kind == "loop":

@@ -117,26 +117,30 @@ def steps(options: Options, worlds: int) -> dict[str, dict[str, Any]]:
 
 
 def foreign(options: Options) -> dict[str, dict[str, Any]]:
-    """Shares of arrivals and collisions of every policy, driver and variant; the transfer policies' medians."""
+    """Shares of arrivals and collisions of every policy, driver and variant; the transfer policies' medians.
+
+    Names say the task, unless it is the corridor.
+    """
     drives = [one for path in options.drives for one in json.loads(path.read_text())["drives"]]
-    groups: dict[tuple[str, str, str], list[str]] = {}
+    groups: dict[tuple[str, str, str, str], list[str]] = {}
     for one in drives:
-        groups.setdefault((one["policy"], one["driver"], one["variant"]), []).append(one["end"])
+        place = "foreign" if one.get("task", "corridor") == "corridor" else f"foreign_{one['task']}"
+        groups.setdefault((place, one["policy"], one["driver"], one["variant"]), []).append(one["end"])
     found: dict[str, dict[str, Any]] = {}
-    seeds: dict[tuple[str, str, str], list[float]] = {}
+    seeds: dict[tuple[str, str, str, str], list[float]] = {}
     device = options.device or device_name()
-    for (policy, driver, variant), ends in sorted(groups.items()):
+    for (place, policy, driver, variant), ends in sorted(groups.items()):
         for end in ("arrived", "collided", *(["stopped"] if driver == "with_stop" else [])):
             share = ends.count(end) / len(ends)
-            name = "_".join(["foreign", policy, *([driver] if driver not in (policy, "policy") else []), variant, end])
+            name = "_".join([place, policy, *([driver] if driver not in (policy, "policy") else []), variant, end])
             found[name] = {"value": share, "unit": "share", "device": device, "drives": len(ends)}
             if policy.startswith("transfer") and driver in ("policy", "with_stop"):
-                seeds.setdefault((driver, variant, end), []).append(share)
-    for (driver, variant, end), shares in seeds.items():
-        name = "_".join(["foreign", *(["with_stop"] if driver == "with_stop" else []), variant])
+                seeds.setdefault((place, driver, variant, end), []).append(share)
+    for (place, driver, variant, end), shares in seeds.items():
+        name = "_".join([place, *(["with_stop"] if driver == "with_stop" else []), variant])
         found[name if end == "arrived" else f"{name}_{end}"] = figure(shares, "share", device)
-    driver = "with_stop" if any(key[0] == "with_stop" for key in seeds) else "policy"
-    collided = [shares for key, shares in seeds.items() if (key[0], key[2]) == (driver, "collided")]
+    driver = "with_stop" if any(key[:2] == ("foreign", "with_stop") for key in seeds) else "policy"
+    collided = [shares for key, shares in seeds.items() if (key[:2], key[3]) == (("foreign", driver), "collided")]
     if collided:
         found["foreign_collided_worst"] = figure(max(collided, key=statistics.median), "share", device)
     return found

@@ -1,4 +1,4 @@
-"""Drive a policy in foreign corridors: `python -m benchmarks.foreign --policy NAME=FOLDER --drives 200 --out FILE`.
+"""Drive a policy in foreign rooms: `python -m benchmarks.foreign --policy NAME=FOLDER --drives 200 --out FILE`.
 
 Needs MUJOCO_GL=egl or osmesa where there is no display. Drives are spread over processes.
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.foreign.drivers import CONTROLS, WITH_STOP, load
+from benchmarks.foreign.plan import PLANS
 from benchmarks.foreign.room import VARIANTS
 from benchmarks.foreign.run import Job, drive_all
 from bridge.nodes.options import Parser, whole
@@ -22,6 +23,7 @@ def main() -> None:
     parser.add_argument("--policy", nargs="*", default=[], metavar="NAME=FOLDER", help="policy files")
     parser.add_argument("--controls", nargs="*", default=[], choices=CONTROLS, help="of the first policy")
     parser.add_argument("--with-stop", action="store_true", help="drive each policy with the limits of its file too")
+    parser.add_argument("--task", choices=PLANS, help="whose ground plan; without it, the task of the policies")
     parser.add_argument("--variants", nargs="*", default=list(VARIANTS), choices=VARIANTS)
     parser.add_argument("--drives", type=whole(), default=200, help="of each policy in each variant")
     parser.add_argument("--first-seed", type=whole(0), default=5000)
@@ -30,19 +32,36 @@ def main() -> None:
     options = parser.parse_args()
     named = [text.split("=", 1) for text in options.policy]
     drivers = ["policy", *([WITH_STOP] if options.with_stop else [])]
-    for _, source in named:
-        load(source, drivers[-1])  # what cannot be driven is refused before anything is
+    policies = {source: load(source, drivers[-1]) for _, source in named}  # refused before anything is driven
+    task = options.task or task_of({source: one.contract.task for source, one in policies.items()})
     jobs: list[Job] = []
     for variant in options.variants:
         for seed in range(options.first_seed, options.first_seed + options.drives):
-            jobs += [(variant, seed, name, source, driver) for name, source in named for driver in drivers]
+            jobs += [(task, variant, seed, name, source, driver) for name, source in named for driver in drivers]
             for control in options.controls:
                 sighted = control in ("blank", "frozen")
                 name, source = named[0] if sighted else (control, "")
-                jobs.append((variant, seed, name if sighted else control, source, control))
+                jobs.append((task, variant, seed, name if sighted else control, source, control))
     results = drive_all(jobs, options.processes, options.out)
     for line in table(results):
         print(line)
+
+
+def task_of(tasks: dict[str, str]) -> str:
+    """The task that all policies have learned, by their folders; the corridor where there are none.
+
+    Raises:
+        ValueError: there is no room for a task, or the tasks differ.
+    """
+    for source, task in tasks.items():
+        if task not in PLANS:
+            raise ValueError(f"{source}/policy.json: task is {task!r}; there are rooms for {', '.join(PLANS)}. Choose "
+                             "one of them with --task.")
+        if task != next(iter(tasks.values())):
+            both = ", ".join(f"{source} {task}" for source, task in tasks.items())
+            raise ValueError(f"the policies have learned different tasks ({both}). Drive those of one task, or choose "
+                             "it with --task.")
+    return next(iter(tasks.values()), "corridor")
 
 
 def table(results: list[dict[str, Any]]) -> list[str]:

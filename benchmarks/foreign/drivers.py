@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.foreign.drive import PERIOD, Pose
-from benchmarks.foreign.room import AHEAD, BEGIN, END, GOAL, WIDTH, Room
+from benchmarks.foreign.plan import BEGIN
+from benchmarks.foreign.room import AHEAD, Room
 from bridge.safeguards.safety import SafetyConfig
 
 CONTROLS = ("planner", "straight", "blank", "frozen")
@@ -26,10 +27,9 @@ class Planner:
     """Follows a path that it searched with the truth: A* over place and heading, then pure pursuit."""
 
     def __init__(self, room: Room) -> None:
-        x, y, half_x, half_y, yaw = room.carton
-        boxes = [(x, y, half_x, half_y, yaw), *((*thing, 0.0) for thing in room.things)]
-        self.boxes = np.array(boxes)
-        self.path = self._search(room.start)
+        self.plan = room.plan
+        self.boxes = np.array([(*one[:4], one.yaw) for one in (*room.obstacles, *room.things)])
+        self.path = self._search(room.plan.start)
 
     def command(self, pose: Pose) -> tuple[float, float]:
         """v [m/s], omega [rad/s]."""
@@ -45,7 +45,7 @@ class Planner:
         left = math.inf
         for along in (AHEAD - 0.2, AHEAD, AHEAD + 0.2):
             cx, cy = x + along * math.cos(yaw), y + along * math.sin(yaw)
-            left = min(left, WIDTH / 2 - abs(cy), END - cx, cx - BEGIN)
+            left = min(left, self.plan.half_width - abs(cy), self.plan.end - cx, cx - BEGIN)
             dx, dy = cx - self.boxes[:, 0], cy - self.boxes[:, 1]
             cos, sin = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
             out_x = np.maximum(np.abs(dx * cos + dy * sin) - self.boxes[:, 2], 0.0)
@@ -55,6 +55,7 @@ class Planner:
 
     def _search(self, start: tuple[float, float, float]) -> np.ndarray:
         """(K, 3) poses from the start to the goal's circle, 0.1 m apart."""
+        goal = self.plan.goal
         heap: list[Any] = [(0.0, 0.0, start, ())]
         came: dict[tuple[int, int, int], Any] = {}
         while heap:
@@ -63,7 +64,7 @@ class Planner:
             if cell in came:
                 continue
             came[cell] = (pose, before)
-            if math.hypot(pose[0] - GOAL[0], pose[1] - GOAL[1]) < 0.9:
+            if math.hypot(pose[0] - goal[0], pose[1] - goal[1]) < 0.9:
                 path = [pose]
                 while before:
                     pose, before = came[before]
@@ -76,8 +77,8 @@ class Planner:
                 if left < 0.02 or abs(yaw) > 1.5:
                     continue
                 spent = cost + forward + 0.3 * abs(turn) + 0.2 * max(0.0, 0.2 - left) + (0.05 if not forward else 0.0)
-                heapq.heappush(heap, (spent + math.hypot(after[0] - GOAL[0], after[1] - GOAL[1]), spent, after, cell))
-        return np.array([start, (GOAL[0], GOAL[1], 0.0)])
+                heapq.heappush(heap, (spent + math.hypot(after[0] - goal[0], after[1] - goal[1]), spent, after, cell))
+        return np.array([start, (*goal, 0.0)])
 
 
 class Sighted:

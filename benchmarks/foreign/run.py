@@ -1,4 +1,4 @@
-"""One drive in a foreign corridor, and many of them spread over processes."""
+"""One drive in a foreign room, and many of them spread over processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.foreign.camera import Camera
 from benchmarks.foreign.drive import SteppedPlant
 from benchmarks.foreign.drivers import Planner, Sighted, load
-from benchmarks.foreign.room import GOAL, VARIANTS, make_room
+from benchmarks.foreign.room import VARIANTS, make_room
 from benchmarks.plant.chair import Chair
 
 STEPS = 300
@@ -24,14 +24,17 @@ MOUNT = {"x": 0.532, "y": 0.0, "z": 0.682, "roll": 0.0, "pitch": 0.15, "yaw": 0.
 """Camera of the drivers that need none."""
 
 
-def drive(variant: str, seed: int, driver: str, policy: Any = None, frames: list | None = None) -> dict[str, Any]:
+def drive(
+    variant: str, seed: int, driver: str, policy: Any = None, frames: list | None = None, task: str = "corridor"
+) -> dict[str, Any]:
     """One drive: how it ended, after how many commands, and what was seen, if `frames` is a list.
 
     It ends as "stopped" where the policy stopped for good, and nothing was reached or touched after that.
     """
-    room = make_room(variant, seed)
+    room = make_room(variant, seed, task)
+    goal = room.plan.goal
     random = np.random.default_rng([seed, 13])
-    plant = SteppedPlant(Chair().on_day(random), room.start, random)
+    plant = SteppedPlant(Chair().on_day(random), room.plan.start, random)
     mount = MOUNT if policy is None else dict(policy.contract.camera)
     camera = Camera(room.model, mount, variant == "plain", np.random.default_rng([seed, 14, VARIANTS.index(variant)]))
     planner = Planner(room) if driver == "planner" else None
@@ -47,7 +50,7 @@ def drive(variant: str, seed: int, driver: str, policy: Any = None, frames: list
             if camera.touches():
                 end = "collided"
                 break
-            if (pose.x - GOAL[0]) ** 2 + (pose.y - GOAL[1]) ** 2 <= 1.0:
+            if (pose.x - goal[0]) ** 2 + (pose.y - goal[1]) ** 2 <= 1.0:
                 end = "arrived"
                 break
             if frames is not None or (sighted is not None and sighted.looks):
@@ -66,22 +69,23 @@ def drive(variant: str, seed: int, driver: str, policy: Any = None, frames: list
             end = "stopped"
     finally:
         camera.close()
-    return {"variant": variant, "seed": seed, "driver": driver, "end": end, "steps": steps, "novelty": novelty}
+    return {"task": task, "variant": variant, "seed": seed, "driver": driver, "end": end, "steps": steps,
+            "novelty": novelty}  # fmt: skip
 
 
 _POLICIES: dict[str, Any] = {}
 
 
-Job = tuple[str, int, str, str, str]
-"""Variant, seed, name and folder of the policy, driver."""
+Job = tuple[str, str, int, str, str, str]
+"""Task, variant, seed, name and folder of the policy, driver."""
 
 
 def _job(job: Job) -> dict[str, Any]:
-    variant, seed, name, source, driver = job
+    task, variant, seed, name, source, driver = job
     if source and source not in _POLICIES:
         _POLICIES[source] = load(source, driver)
     policy = _POLICIES.get(source)
-    return {**drive(variant, seed, driver, policy), "policy": name}
+    return {**drive(variant, seed, driver, policy, task=task), "policy": name}
 
 
 def drive_all(jobs: Sequence[Job], processes: int, out: Path) -> list[dict[str, Any]]:
