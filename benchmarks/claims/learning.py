@@ -345,6 +345,9 @@ CLAIMS = (
                                           for one in ("plain", "furnished", "unseen"))),
             ("arrived, a planner that knows all", *(f"{{foreign_planner_{one}_arrived|%}}"
                                                     for one in ("plain", "furnished", "unseen"))),
+            *((f"obstacle course: arrived, {said}",
+               *(f"{{foreign_obstacle_course_{who}_{one}_arrived|%}}" for one in ("plain", "furnished", "unseen")))
+              for who, said in (("planner", "a planner that knows all"), ("straight", "straight ahead"))),
             ("rank correlation", "{srcc_plain}", "{srcc_furnished}", "{srcc_unseen}"),
         ),
     ),  # fmt: skip

@@ -35,6 +35,9 @@ from sysid.logs.stream_quality import SMOOTHING, speeds
 
 LITTLE = 0.75  # share of the motion that a direction must explain, below which something is wrong
 ANGLE = np.deg2rad(3.0)  # between an axis and the way of travel, that is named
+SAME_WAY, OTHER_SIZE = 0.9, (1.25, 10.0)
+"""Correlation of a pose's rate with the speed beside it, and factors between them that calibration does not explain;
+larger ones are units, which the commands show."""
 BACKWARDS = np.deg2rad(150.0)  # beyond which the sign of v says it already
 FASTER = 0.3  # share of a pose's usual speed, above which it counts as moving
 EMPTY = 0.15  # share of the time in which a pose moves, for which speeds of exactly zero are no standstill
@@ -86,6 +89,8 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
         return [said]
     if not motions:
         return []
+    if name == "odometry" and (of_size := _of_another_size(trials)):
+        return of_size
     plain = pooled([direction(one, reach) for one in motions])
     against = float(np.median([likeness(one.turn, one.omega) for one in motions]))
     if against < -WHOLE and pooled([direction(inverted(one), reach) for one in motions]).explained > max(
@@ -114,6 +119,30 @@ def _of_stream(name: str, trials: Sequence[Trial], reach: float, beside: str) ->
         return [f"{name}: {what} moves {abs(degrees):.0f} deg to the {side} of its own heading: its axes are not "
                 f"the vehicle's. Correct them: {remedy}."]
     return []
+
+
+def _of_another_size(trials: Sequence[Trial]) -> list[str]:
+    """Sentences on an odometry whose pose goes, or turns, by more or less than its own speeds say."""
+    said, moving = [], [one for one in trials if one.odometry is not None and one.odometry.v.std() > NONE]
+    found = [(one, motion) for one in moving if (motion := motion_of(one, "odometry")) is not None]
+    for what, name, columns in (("goes", "v", "x and y"), ("turns", "omega", "yaw")):
+        gains, obeyed = [], []
+        for trial, motion in found:
+            ways = {"v": (np.hypot(*motion.steps.T), np.abs(motion.v)), "omega": (motion.turn, motion.omega)}
+            pose, speed = ways[name]
+            if likeness(pose, speed) > SAME_WAY:
+                gains.append(float(pose @ speed / (speed @ speed)))
+                sent = np.abs(trial.command.at(motion.t - RESPONSE, (0.0, 0.0))[int(name == "omega")])
+                obeyed.append([float(np.abs(one) @ sent / max(sent @ sent, 1e-12)) for one in (pose, speed)])
+        gain = float(np.median(gains)) if gains else 1.0
+        if not OTHER_SIZE[0] < max(gain, 1 / gain) < OTHER_SIZE[1]:
+            continue
+        pose_off, speed_off = np.abs(np.log(np.maximum(np.median(obeyed, axis=0), 1e-6)))
+        better, remedy = ((name, f"multiply {columns} by {1 / gain:.3g}") if speed_off < pose_off else
+                          ("the pose", f"multiply {name} by {gain:.3g}"))
+        said.append(f"odometry: its pose {what} {gain:.2g} times as far as its own {name} says. By the commands "
+                    f"{better} is right: {remedy}, or take both from one source.")
+    return said
 
 
 def _is_mirrored(motions: Sequence[Motion], reach: float) -> bool:

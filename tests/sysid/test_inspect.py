@@ -165,6 +165,21 @@ def log_of(*trials):
     return Log("toy", WHILL_CR, trials, "")
 
 
+@pytest.mark.parametrize("part, factor, said, remedy", [
+    ("xy", 0.5, "its pose goes 0.5 times as far as its own v says", "v is right: multiply x and y by 2"),
+    ("yaw", 0.7, "its pose turns 0.7 times as far as its own omega says", "omega is right: multiply yaw by 1.4"),
+    ("v", 2.0, "its pose goes 0.5 times as far as its own v says", "the pose is right: multiply v by 0.5"),
+    ("omega", 0.5, "its pose turns 2 times as far as its own omega says", "the pose is right: multiply omega by 2"),
+])  # fmt: skip
+def test_an_odometry_whose_pose_and_speeds_differ_in_size_is_named(part, factor, said, remedy):
+    good = trial_of(smooth_command())
+    changed = {name: factor * getattr(good.odometry, name) for name in (("x", "y") if part == "xy" else (part,))}
+    found = " ".join(sanity(log_of(replace(good, odometry=replace(good.odometry, **changed)))))
+    assert f"odometry: {said}" in found and remedy in found
+    close = {name: values * 1.1 / factor for name, values in changed.items()}
+    assert "times as far" not in " ".join(sanity(log_of(replace(good, odometry=replace(good.odometry, **close)))))
+
+
 def test_units_and_signs_that_the_commands_contradict_are_named():
     good = trial_of(smooth_command())
     assert sanity(log_of(good)) == []

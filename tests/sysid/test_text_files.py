@@ -30,6 +30,8 @@ from whill_mjx.vehicle.vehicle_file import save_vehicle
 pytestmark = pytest.mark.quick
 CHAIR = {trial.name: trial for trial in load_log(Path(sysid.__file__).parent / "data" / "chair").trials}
 DRIVE = CHAIR["random_1"]
+NAMES = {"t": "t", "cv": "cmd_v", "cw": "cmd_omega", "x": "odom_x", "y": "odom_y", "yaw": "odom_yaw", "v": "odom_v",
+         "w": "odom_omega"}  # fmt: skip
 T0 = 1.7e9  # s, Unix time
 
 
@@ -720,6 +722,68 @@ def test_drives_in_which_a_unit_does_not_show_have_that_of_the_others(tmp_path):
         for quantity in ("x", "y", "yaw", "v", "omega"):
             there = getattr(CHAIR[trial.name].odometry, quantity)
             np.testing.assert_allclose(getattr(trial.odometry, quantity), there, atol=1e-3)
+
+
+@pytest.mark.parametrize("role, name, unit, size", [
+    ("cv", "cmd_v [knots]", "kn", 1852 / 3600), ("v", "odom_v (feet/s)", "ft/s", 0.3048),
+    ("v", "odom_v [m/min]", "m/min", 1 / 60), ("w", "odom_omega [rps]", "rev/s", 2 * np.pi),
+    ("w", "odom_omega [rad/min]", "rad/min", 1 / 60), ("yaw", "odom_yaw [gon]", "gon", np.pi / 200),
+])  # fmt: skip
+def test_a_unit_that_is_written_counts_and_no_other_one(tmp_path, role, name, unit, size):
+    values = columns()
+    table = {name if key == role else plain: values[key] / (size if key == role else 1.0)
+             for key, plain in NAMES.items()}  # fmt: skip
+    found = guess([read_table(write(tmp_path / "drive.csv", table))])
+    assert next(one.unit for one in found if one.name == name) == unit
+
+
+@pytest.mark.parametrize("name", ["odom_v [um/s]", "odom_v [parsec/h]", "cmd_v [%]"])
+def test_a_unit_that_is_written_and_not_known_is_refused_however_the_numbers_look(tmp_path, name):
+    values, role = columns(), "cv" if name.startswith("cmd") else "v"
+    table = {name if key == role else NAMES[key]: values[key] for key in NAMES}
+    path = write(tmp_path / "drive.csv", table)
+    with pytest.raises(ValueError, match=r"drive.csv: the unit .* is not known \(known: m/s, .*UNIT; else convert"):
+        convert(ConvertConfig(source=path, out=tmp_path / "log"))
+    assert not (tmp_path / "log").exists()
+
+
+@pytest.mark.parametrize("late", [0.5, None])
+def test_two_clocks_in_one_file_are_refused_unless_they_are_the_same(tmp_path, late):
+    values = columns()
+    table = {"cmd_time": values["t"], "cmd_v": values["cv"], "cmd_omega": values["cw"],
+             "odom_time": values["t"] + (late or 0.0), "odom_x": values["x"], "odom_y": values["y"],
+             "odom_yaw": values["yaw"], "odom_v": values["v"], "odom_omega": values["w"]}  # fmt: skip
+    path = write(tmp_path / "drive.csv", table)
+    if late is None:
+        convert(ConvertConfig(source=path, out=tmp_path / "log"))
+        check(load_log(tmp_path / "log").trials[0])
+        return
+    with pytest.raises(ValueError, match="drive/cmd_time and drive/odom_time are times of different streams.*own"):
+        convert(ConvertConfig(source=path, out=tmp_path / "log"))
+
+
+@pytest.mark.parametrize("minus", ["\u2212", "\u2013", "()"])
+def test_negative_numbers_may_have_a_minus_sign_a_dash_or_parentheses(tmp_path, minus):
+    values = columns()
+    path = write(tmp_path / "drive.csv", {name: values[key] for key, name in NAMES.items()})
+    text = path.read_text()
+    changed = re.sub(r"-([\d.]+)", r"(\1)", text) if minus == "()" else text.replace("-", minus)
+    path.write_text(changed, encoding="utf-8")
+    _, notes = convert(ConvertConfig(source=path, out=tmp_path / "log")), load_log(tmp_path / "log").notes
+    check(load_log(tmp_path / "log").trials[0])
+    assert "no number" not in " ".join(notes) and "are none" not in " ".join(notes)
+
+
+@pytest.mark.parametrize("broken", ["newest first", "cells missing"])
+def test_units_show_in_rows_of_any_order_and_beside_missing_cells(tmp_path, broken):
+    values = columns()
+    table = {name: values[key] / (0.44704 if key in ("v", "cv") else 1.0) for key, name in NAMES.items()}
+    if broken == "newest first":
+        table = {name: one[::-1] for name, one in table.items()}
+    else:
+        table["odom_x"] = np.where(np.isin(np.arange(len(values["t"])), (50, 51, 90)), np.nan, table["odom_x"])
+    found = guess([read_table(write(tmp_path / "drive.csv", table))])
+    assert {one.unit for one in found if one.role in ("command.v", "odometry.v")} == {"mph"}
 
 
 def test_a_unit_that_is_left_out_of_a_flag_is_found_as_elsewhere(tmp_path):

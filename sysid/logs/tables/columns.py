@@ -23,6 +23,12 @@ UNITS = {  # kind -> unit -> SI
     "rate": {"rad/s": 1.0, "deg/s": np.pi / 180, "mrad/s": 1e-3, "rpm": 2 * np.pi / 60},
     "none": {"-": 1.0},
 }
+RARE = {
+    "length": {"yd": 0.9144, "dm": 0.1}, "angle": {"gon": np.pi / 200},
+    "speed": {"kn": 1852 / 3600, "m/min": 1 / 60, "ft/min": 0.3048 / 60, "in/s": 0.0254, "dm/s": 0.1},
+    "rate": {"rev/s": 2 * np.pi, "rad/min": 1 / 60, "deg/min": np.pi / 180 / 60, "gon/s": np.pi / 200},
+}  # fmt: skip
+"""Units that count where they are written; numbers alone show none of them."""
 SPELLED = {
     "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms", "milliseconds": "ms",
     "usec": "us", "micros": "us", "nsec": "ns", "nsecs": "ns", "nanosec": "ns", "nanoseconds": "ns", "nanos": "ns",
@@ -31,6 +37,11 @@ SPELLED = {
     "degps": "deg/s", "degs": "deg/s", "meter": "m", "meters": "m", "metre": "m", "metres": "m", "m s": "m/s",
     "mins": "min", "minute": "min", "minutes": "min", "hour": "h", "hours": "h", "hrs": "h", "day": "d", "days": "d",
     "km h": "km/h", "mm s": "mm/s", "cm s": "cm/s", "rad s": "rad/s", "deg s": "deg/s", "°": "deg", "°/s": "deg/s",
+    "feet": "ft", "foot": "ft", "feet/s": "ft/s", "fps": "ft/s", "feet/min": "ft/min", "inch": "in", "inches": "in",
+    "inches/s": "in/s", "yard": "yd", "yards": "yd", "knot": "kn", "knots": "kn", "kt": "kn", "kts": "kn",
+    "mi/h": "mph", "miles/h": "mph", "meters/s": "m/s", "metres/s": "m/s", "gons": "gon", "grad": "gon",
+    "grads": "gon", "grad/s": "gon/s", "turn": "rev", "turns": "rev", "revs": "rev", "rps": "rev/s",
+    "rev/min": "rpm", "r/min": "rpm", "u/min": "rpm", "1/min": "rpm", "radians/s": "rad/s", "degrees/s": "deg/s",
 }
 PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")  # A unit of ticks: so many in a turn
 PER_SECOND = re.compile(r"(\d+(?:\.\d+)?) ?hz")  # A unit of rows: so many in a second
@@ -85,7 +96,8 @@ def kind_of(role: str) -> str:
 def units_of(role: str) -> dict[str, float]:
     """The units of a role that have a name, and their sizes in SI units; a wheel's speed may be that of its rim."""
     wheel = role.rpartition(".")[2] in ("left", "right")
-    return UNITS["speed"] | UNITS["rate"] if wheel else UNITS[kind_of(role)]
+    kinds = ("speed", "rate") if wheel else (kind_of(role),)
+    return {unit: size for kind in kinds for unit, size in (UNITS[kind] | RARE.get(kind, {})).items()}
 
 
 def size_of(role: str, unit: str) -> float:
@@ -111,4 +123,4 @@ def unit_of(text: str) -> str:
 
 def unit_named(text: str) -> bool:
     """Whether a text is the name of a unit."""
-    return any(unit_of(text.strip("[]()")) in units for units in UNITS.values())
+    return any(unit_of(text.strip("[]()")) in units for units in (*UNITS.values(), *RARE.values()))

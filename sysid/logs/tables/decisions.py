@@ -10,13 +10,35 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.logs.tables.columns import ROLES, SAID, Column, Table, is_unit_of, kind_of, size_of, unit_of, units_of
+from sysid.logs.tables.columns import (
+    ROLES,
+    SAID,
+    Column,
+    Table,
+    is_unit_of,
+    kind_of,
+    size_of,
+    unit_named,
+    unit_of,
+    units_of,
+)
 from sysid.logs.tables.guess import guess
-from sysid.logs.tables.names import COUNTS, TICKS, TIME_WORDS, by_name, says_any_stream, split_unit
+from sysid.logs.tables.names import (
+    COUNTS,
+    STREAM_WORDS,
+    TICKS,
+    TIME_WORDS,
+    by_name,
+    says_any_stream,
+    says_stream,
+    split_unit,
+)
 from sysid.logs.tables.sizes import TURNED
 from whill_mjx.io.fields import shown
 
 NAMED = 12  # columns that an error lists
+MEASURE = re.compile(r"[^\W\d_] ?[/%]|%|^hz$")
+"""In texts behind a name that are units: of others nobody knows, and numbers show the unit."""
 SAME = 0.02  # of a column's range, within which another one holds the same
 FAR_MORE, STEEP, LEAST_WAY = 3.0, 0.3, 0.3
 """Times the least of x and y, share of the greatest, and m of that at least: no vehicle on a floor rises by as much."""
@@ -117,8 +139,8 @@ def _problem(tables: Sequence[Table], columns: Sequence[Column]) -> str:
         said = said or next((f" If its {name} counts rows, say how many there are in a second: time={table.stem}/{name}"
                              ":100hz." for name in table.columns if COUNTS.search(name)), "")
         return f"no column of {timeless[0]} is surely its time.{said}"
-    if sideways := _of_a_camera(tables, columns):
-        return sideways
+    if said := _of_a_camera(tables, columns) or _of_no_unit(columns) or _of_two_clocks(tables, columns):
+        return said
     arrays = {(table.stem, name): values for table in tables for name, values in table.columns.items()}
     for one in columns:
         values = arrays[one.file, one.name]
@@ -172,6 +194,36 @@ def _rivals(tables: Sequence[Table], columns: Sequence[Column]) -> str:
             if _differ(arrays[mine.file, mine.name], mine, arrays[table.stem, name], other):
                 return (f"{mine.file}/{mine.name} and {table.stem}/{name} may both be {mine.role}, and they differ. "
                         f"Say which is: {mine.role}=COLUMN.")
+    return ""
+
+
+def _of_no_unit(columns: Sequence[Column]) -> str:
+    """A sentence on a column whose name states a unit that is not known: its numbers would be read in another one."""
+    for one in columns:
+        unit = split_unit(one.name)[1]
+        if one.guessed and MEASURE.search(unit) and not unit_named(unit) and not is_unit_of(one.role, unit):
+            known = ", ".join(units_of(one.role))
+            return (f"the unit {unit!r} of {one.file}/{one.name} is not known (known: {known}). If it is one of these, "
+                    f"say {one.role}={one.file}/{one.name}:UNIT; else convert the column.")
+    return ""
+
+
+def _of_two_clocks(tables: Sequence[Table], columns: Sequence[Column]) -> str:
+    """A sentence on two columns of a file that are the times of two streams, and differ: a file has one time."""
+    for table in tables:
+        used = STREAM_WORDS.keys() & {one.role.partition(".")[0] for one in columns if one.file == table.stem}
+        clocks: dict[str, str] = {}  # by stream
+        for name in table.columns:
+            column = by_name(table, name)
+            if column is not None and column.role == "time":
+                clocks |= {stream: name for stream in used if says_stream(name, stream)}
+        if len(set(clocks.values())) > 1:
+            one, other, *_ = dict.fromkeys(clocks.values())
+            first, second = (table.columns[name] for name in (one, other))
+            step = float(np.nanmedian(np.abs(np.diff(first))))
+            if not np.allclose(first, second, rtol=0.0, atol=SAME * step, equal_nan=True):
+                return (f"{table.stem}/{one} and {table.stem}/{other} are times of different streams, and they differ, "
+                        "while a file has one time. Write each stream with its time to a file of its own.")
     return ""
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from sysid.logs.planar import differenced, yaw_of
-from sysid.logs.tables.columns import UNITS, Column, is_unit_of, kind_of, size_of
+from sysid.logs.tables.columns import UNITS, Column, is_unit_of, kind_of, size_of, units_of
 
 FASTEST_STEP, SLOWEST_STEP = 5e-4, 4.0  # s; rows that follow faster, or slower, are in another unit of time
 SHORTEST = 10.0  # s; a recording that would be shorter is in a larger unit
@@ -94,12 +95,17 @@ class _Known:
         """Times [s] and values of a role in SI units; None where there are few, or its unit is not known."""
         one = self.columns.get(role)
         clock = self.clocks.get(one.file) if one is not None else None
-        if one is None or clock is None or (unit or one.unit) not in UNITS[kind_of(role)]:
+        if one is None or clock is None or not self._shows(role, unit or one.unit):
             return None
         t = self.arrays[clock.file, clock.name] * size_of("time", clock.unit)
-        values = self.arrays[one.file, one.name] * (one.sign * UNITS[kind_of(role)][unit or one.unit])
-        good = np.isfinite(t) & np.isfinite(values)
-        return (t[good], values[good]) if good.sum() > 20 else None
+        values = self.arrays[one.file, one.name] * (one.sign * size_of(role, unit or one.unit))
+        good = np.flatnonzero(np.isfinite(t) & np.isfinite(values))
+        good = good[np.argsort(t[good], kind="stable")]  # the newest row may come first
+        return (t[good], values[good]) if len(good) > 20 else None
+
+    def _shows(self, role: str, unit: str) -> bool:
+        """Whether a unit says how large the numbers of a role are: a wheel's may be those of its rim."""
+        return is_unit_of(role, unit) and (kind_of(role) != "rate" or unit not in units_of("command.v"))
 
     def raw(self, role: str) -> Signal | None:
         """The same as if it were in SI units already."""
@@ -108,7 +114,7 @@ class _Known:
     def settle(self, role: str, reference: Signal | None, why: str, loose: float = ALIKE) -> None:
         """Find the unit in which a signal is as large as a reference."""
         one, mine = self.columns.get(role), self.raw(role)
-        if one is None or one.unit in UNITS[kind_of(role)] or mine is None:
+        if one is None or is_unit_of(role, one.unit) or mine is None:
             return
         unit = _unit_like(mine, reference, UNITS[kind_of(role)], loose)
         if unit is not None:
@@ -130,7 +136,7 @@ class _Known:
     def settle_pose(self, stream: str) -> None:
         """Find the units of a pose: of its heading by what it follows, of its place by how fast it moves."""
         role = f"{stream}.yaw"
-        if (one := self.columns.get(role)) and one.unit not in UNITS["angle"] and (mine := self.raw(role)):
+        if (one := self.columns.get(role)) and not is_unit_of(role, one.unit) and (mine := self.raw(role)):
             span = float(np.ptp(mine[1]))
             shown = _begun_anew(mine[1]) or self._along_path(stream, mine) or self._as_turned(mine)
             unit, why = shown or ("deg" if span > 30 else "rad", "its range")
@@ -139,7 +145,7 @@ class _Known:
         axes = [place for axis in ("x", "y") if (place := self.raw(f"{stream}.{axis}"))]
         rate = max((float(np.percentile(np.abs(_rate(*place)[1]), 90)) for place in axes), default=0.0)
         for role in (f"{stream}.x", f"{stream}.y"):
-            if (one := self.columns.get(role)) and one.unit not in UNITS["length"] and self.raw(role):
+            if (one := self.columns.get(role)) and not is_unit_of(role, one.unit) and self.raw(role):
                 self.columns[role] = replace(one, unit="mm" if rate > TOO_FAST else "m", why=f"{one.why}; its rate",
                                              assumed=rate <= TOO_FAST, moves=rate >= TOO_SLOW)
         for role in (f"{stream}.{one}" for one in ("qx", "qy", "qz", "qw")):
@@ -148,10 +154,10 @@ class _Known:
 
     def _along_path(self, stream: str, yaw: Signal) -> tuple[str, str] | None:
         """The unit in which a heading follows the direction of the path, and why; None where several do, or none."""
-        x, y = self.raw(f"{stream}.x"), self.raw(f"{stream}.y")
-        if x is None or y is None or len(x[0]) != len(y[0]):
+        x, y = _together(self.raw(f"{stream}.x"), self.raw(f"{stream}.y"))
+        if x is None or y is None:
             return None
-        (t, dx), (_, dy) = _rate(*x, STEPPED), _rate(*y, STEPPED)
+        (t, dx), (_, dy) = (_rate(one[0], one[1], STEPPED) for one in (x, y))
         way, double = np.hypot(dx, dy), 2 * np.arctan2(dy, dx)  # twice the angle: it may drive backwards
         moving = way > 0.3 * np.percentile(way, 95)
         if not moving.any():
@@ -185,12 +191,25 @@ class _Known:
     def heading(self, stream: str) -> Signal | None:
         """Times [s] and heading [rad] of a pose, without jumps."""
         parts = {one: part for one in ("qw", "qx", "qy", "qz") if (part := self.signal(f"{stream}.{one}"))}
-        if {"qw", "qz"} <= set(parts) and len({len(part[0]) for part in parts.values()}) == 1:
+        if {"qw", "qz"} <= set(parts):
+            parts = dict(zip(parts, _together(*parts.values()), strict=True))
             t, w = parts["qw"]
             x, y, z = (parts[one][1] if one in parts else np.zeros(len(t)) for one in ("qx", "qy", "qz"))
             return t, np.unwrap(yaw_of(w, x, y, z))
         yaw = self.signal(f"{stream}.yaw")
         return (yaw[0], np.unwrap(yaw[1])) if yaw else None
+
+
+def _together(*signals: Signal | None) -> tuple[Any, ...]:
+    """The signals at the times that all of them have; all None where one is, or where they share few."""
+    shared: np.ndarray | None = None
+    for one in signals:
+        if one is None:
+            return (None,) * len(signals)
+        shared = np.unique(one[0]) if shared is None else np.intersect1d(shared, one[0])
+    if shared is None or len(shared) <= 20:
+        return (None,) * len(signals)
+    return tuple((shared, one[1][np.searchsorted(one[0], shared)]) for one in signals if one is not None)
 
 
 def _first(*signals: Signal | None) -> Signal | None:
@@ -263,7 +282,8 @@ def _grid(t: np.ndarray, begin: float, end: float) -> np.ndarray:
 
 
 def _way(x: Signal | None, y: Signal | None) -> Signal | None:
-    if x is None or y is None or len(x[0]) != len(y[0]):
+    x, y = _together(x, y)
+    if x is None or y is None:
         return None
     (t, vx), (_, vy) = _rate(*x), _rate(*y)
     return t, np.hypot(vx, vy)

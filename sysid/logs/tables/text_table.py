@@ -257,6 +257,7 @@ def _names_in(text: str, count: int) -> list[str]:
 
 def without_separators(cells: Sequence[str]) -> list[str]:
     """The cells of a column with decimal points, and without the separators of thousands that some of them show."""
+    cells = [_signed(cell) for cell in cells]
     if any(re.fullmatch(r"[-+]?\d{1,3}(\.\d{3})+,\d+|[-+]?\d{1,3}(\.\d{3}){2,}", cell) for cell in cells):
         cells = [cell.replace(".", "") for cell in cells]
     if any(re.fullmatch(r"[-+]?\d{1,3}(,\d{3})+\.\d+|[-+]?\d{1,3}(,\d{3}){2,}", cell) for cell in cells):
@@ -301,7 +302,18 @@ def _date(match: re.Match[str], day_first: bool) -> datetime:
     return datetime(year, month, day, hour, int(match[6]), int(match[7] or 0), int((match[8] or "0")[:6].ljust(6, "0")))
 
 
+def _signed(cell: str) -> str:
+    """A number with a hyphen for its sign: spreadsheets write a minus sign or a dash, bookkeepers parentheses."""
+    if cell.isascii() and cell[:1] != "(":
+        return cell
+    cell = cell.replace("\u2212", "-")
+    if cell[:1] == "\u2013":
+        return f"-{cell[1:].lstrip()}"
+    return f"-{match[1]}" if (match := re.fullmatch(r"\(\s*(\d[\d.,]*([eE]-?\d+)?)\s*\)", cell)) else cell
+
+
 def number_of(cell: str) -> float:
+    cell = _signed(cell)
     try:
         return float("nan" if "_" in cell else cell)  # 1_0 is a number in Python alone
     except ValueError:
