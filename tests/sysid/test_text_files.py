@@ -786,6 +786,17 @@ def test_units_show_in_rows_of_any_order_and_beside_missing_cells(tmp_path, brok
     assert {one.unit for one in found if one.role in ("command.v", "odometry.v")} == {"mph"}
 
 
+@pytest.mark.parametrize("key, size, asked", [("t", 1 / 60, "time"), ("x", 100.0, "odom_x")])
+def test_minutes_and_centimetres_that_nothing_states_are_asked_for(tmp_path, key, size, asked):
+    """In seconds and metres the recording would last half a second, and the vehicle drive at tens of m/s."""
+    values = columns()
+    scaled = {"t": ("t",), "x": ("x", "y", "v", "cv")}[key]
+    table = {NAMES[name]: values[name] * (size if name in scaled else 1.0) for name in NAMES}
+    path = write(tmp_path / "drive.csv", table, digits=8)
+    with pytest.raises(ValueError, match=f"it is not clear what .*{asked}"):
+        convert(ConvertConfig(source=path, out=tmp_path / "log"))
+
+
 def test_a_unit_that_is_left_out_of_a_flag_is_found_as_elsewhere(tmp_path):
     drive = write(tmp_path / "drive.csv", foreign(columns()) | {"b [deg/s]": np.rad2deg(columns()["w"])})
     flags = ("time=ms", "command.v=target speed", "odometry.omega=b [deg/s]", "odometry.yaw=heading")

@@ -16,7 +16,10 @@ SHORTEST = 10.0  # s; a recording that would be shorter is in a larger unit
 DATES = (1e9, 1e10)  # s since 1970
 SERIAL_DAYS, DAY_STEP = ((2e4, 6e4), (7.2e5, 7.6e5)), 5e-5
 """Ranges of dates that count days, as spreadsheets and MATLAB have them, and the longest step of such a recording."""
-TOO_FAST = 50.0  # m/s; a pose that often moves faster is in millimetres
+TOO_FAST, DOUBTFUL = 50.0, (10.0, 100.0)
+"""Speed [m/s] of a pose that often moves faster, so that it is in millimetres; and speeds of one that may as well be in
+centimetres, and is asked for."""
+RAPID = 2e-3  # s; rows of a recording shorter than SHORTEST that follow faster may be in a larger unit
 TOO_SLOW = 0.02  # m/s; a pose that never moves faster shows no unit
 TURNED = 0.3  # rad; the same of a heading
 FULL_TURN = 0.9  # of it, beyond which the step between two rows is that of a heading that begins anew
@@ -49,6 +52,7 @@ def with_time_unit(column: Column, values: np.ndarray) -> Column:
             and (unit == "s" or span * UNITS["time"][unit] >= SHORTEST)]
     usual = [unit for unit in able if step * UNITS["time"][unit] < SLOWEST_STEP]
     clear = len(usual or able) == 1 or "s" in usual and DATES[0] < first < DATES[1]
+    clear &= span >= SHORTEST or step >= RAPID
     return replace(column, unit=(usual or able or ["s"])[0], why=f"it steps by {step:.3g}", sure=column.sure and clear)
 
 
@@ -147,7 +151,8 @@ class _Known:
         for role in (f"{stream}.x", f"{stream}.y"):
             if (one := self.columns.get(role)) and not is_unit_of(role, one.unit) and self.raw(role):
                 self.columns[role] = replace(one, unit="mm" if rate > TOO_FAST else "m", why=f"{one.why}; its rate",
-                                             assumed=rate <= TOO_FAST, moves=rate >= TOO_SLOW)
+                                             assumed=rate <= TOO_FAST, moves=rate >= TOO_SLOW,
+                                             sure=one.sure and not DOUBTFUL[0] < rate < DOUBTFUL[1])
         for role in (f"{stream}.{one}" for one in ("qx", "qy", "qz", "qw")):
             if one := self.columns.get(role):
                 self.columns[role] = replace(one, unit="-")
