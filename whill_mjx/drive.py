@@ -93,6 +93,10 @@ def main(options: DriveOptions, stage: Callable[[str], None] = lambda text: None
             f"vehicle {options.vehicle!r} with effects {' '.join(options.effects) or 'none'}: the motion became "
             f"non-finite in {lost}. Bring the effects' values closer to those in docs/effects.md."
         )
+    for sensor, values in motions.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"vehicle {options.vehicle!r} with effects {' '.join(options.effects) or 'none'}: what "
+                             f"{sensor} shows became non-finite. Correct the effect that acts on its reading.")
     with new_folder(options.out) as partial:
         noise = Noise(options.noise_levels if options.noise else None, random)
         for index, (name, command, _) in enumerate(trials):

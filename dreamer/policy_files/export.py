@@ -90,7 +90,7 @@ class PolicyContract:
         if not all(low < high for low, high in zip(self.action_low, self.action_high, strict=True)):
             raise ValueError(f"PolicyContract: action_low = {self.action_low} must be below action_high = "
                              f"{self.action_high} in each component. Swap them.")
-        if not (self.rate_hz > 0 and self.action_repeat >= 1 and self.height >= 1 and self.width >= 1):
+        if not (self.rate_hz > 0 and 1 <= self.action_repeat <= 100 and self.height >= 1 and self.width >= 1):
             raise ValueError(f"PolicyContract: rate_hz = {self.rate_hz}, action_repeat = {self.action_repeat}, image "
                              f"{self.height} x {self.width} must all be positive. Correct the contract.")
 

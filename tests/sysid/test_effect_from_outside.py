@@ -20,14 +20,13 @@ from sysid.follow_up.next_manoeuvre import sensor_for
 from sysid.logs.log import load_log
 from sysid.missing.catalogue import falsifiers, hypotheses
 from sysid.pages.loop_report import make_report, write_run
-from sysid.replay.models import with_effects
 from sysid.replay.rollout import vehicle_plant
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
 from sysid.verdict.pipeline import find_missing
 from sysid.verdict.result import LoopConfig
 from whill_mjx.batch import make_batch
-from whill_mjx.effects import EFFECTS, Effect, make_effect, register, unregister
+from whill_mjx.effects import EFFECTS, Effect, make_effect, register, texts, unregister
 from whill_mjx.effects.card import Axis, Card, Falsifier, Variant
 from whill_mjx.effects.registry import all_effects
 from whill_mjx.env import make_env
@@ -122,6 +121,17 @@ def test_an_installed_package_that_cannot_be_loaded_is_named(installed):
 
 
 @quick
+def test_an_effect_without_usual_values_needs_some_to_be_added(registered, monkeypatch):
+    spec, params = preset("whill_cr")
+    added = texts.with_effects(params, ["heading_drift"]).effects[-1]
+    assert float(added.rate) == pytest.approx(HeadingDrift.typical["rate"][1])
+    monkeypatch.setattr(HeadingDrift, "typical", {})
+    with pytest.raises(ValueError, match="heading_drift has no usual values.*heading_drift:rate=VALUE"):
+        texts.with_effects(params, ["heading_drift"])
+    assert float(texts.with_effects(params, ["heading_drift:rate=0.01"]).effects[-1].rate) == pytest.approx(0.01)
+
+
+@quick
 def test_a_class_that_is_no_complete_effect_is_refused(registered):
     with pytest.raises(TypeError, match="not an effect"):
         register(Axis)
@@ -133,6 +143,9 @@ def test_a_class_that_is_no_complete_effect_is_refused(registered):
         register(type("Faulty", (HeadingDrift,), {"card": card, "name": "faulty"}))
     with pytest.raises(ValueError, match="identifier"):
         register(type("Unnamed", (HeadingDrift,), {"name": "two words"}))
+    for usual in (0.02, "small", (0.02, -0.02), (0.0, float("nan"))):
+        with pytest.raises(ValueError, match="'faulty': the usual values of rate must be two finite numbers"):
+            register(type("Faulty", (HeadingDrift,), {"typical": {"rate": usual}, "name": "faulty"}))
     with pytest.raises(ValueError, match="nothing is known as 'weather' .known: speed"):
         Falsifier("does not depend on the weather", "weather")
     assert "faulty" not in EFFECTS and Effect.card == Card()
@@ -140,7 +153,7 @@ def test_a_class_that_is_no_complete_effect_is_refused(registered):
 
 def test_it_is_randomised_in_a_batch_of_environments(registered):
     env, params = make_env(ObstacleCourse(max_steps=3), height=16, width=16)
-    params = set_values(with_effects(params, ["heading_drift"]), [RATE], np.array([PLANTED]))
+    params = set_values(texts.with_effects(params, ["heading_drift"]), [RATE], np.array([PLANTED]))
     batch = make_batch(env, params, 4, spread=0.2)
     state, _ = jax.jit(batch.reset)(jax.random.key(0))
     rates = np.asarray(state.params.effects[-1].rate)

@@ -27,7 +27,7 @@ from whill_mjx.evaluation.output.output_files import write_pictures
 from whill_mjx.evaluation.output.pages import episode_video
 from whill_mjx.evaluation.policies.onnx_network import Network
 from whill_mjx.evaluation.policies.policy_file import load_policy
-from whill_mjx.evaluation.preparation import choose_task
+from whill_mjx.evaluation.preparation import choose_task, make_plan
 from whill_mjx.evaluation.rollouts import CHANNELS, View, rollout
 from whill_mjx.evaluation.sweeps import Axis, Sweep, parse_sweep, with_parameter
 from whill_mjx.io.html import STYLE
@@ -414,6 +414,17 @@ def test_task_fields_come_from_the_run_the_policy_and_the_command(seeker):
         choose_task(EvaluateOptions(str(seeker), set=("gate=1",)), policy)
     with pytest.raises(ValueError, match="is no whole number"):
         choose_task(EvaluateOptions(str(seeker), set=("gates=two",)), policy)
+    with pytest.raises(ValueError, match="action_repeat=3: .* holds each decision for 2 control periods"):
+        choose_task(EvaluateOptions(str(seeker), set=("action_repeat=3",)), policy)
+    assert choose_task(EvaluateOptions(str(seeker), set=("action_repeat=2",)), policy).action_repeat == 2
+
+
+@pytest.mark.quick
+def test_a_sweep_by_factors_of_what_the_vehicle_lacks_is_refused(tmp_path):
+    options = EvaluateOptions("random", "point_goal", vehicle="whill_cr_physical", out=tmp_path / "out", videos=0,
+                              sweep=("sensor_delay.delay=0.5x,2x",))
+    with pytest.raises(ValueError, match="sweep sensor_delay.delay=0.5x,2x: the vehicle lacks sensor_delay"):
+        make_plan(options)
 
 
 @pytest.fixture(scope="module")

@@ -211,6 +211,8 @@ def test_the_image_may_have_an_absolute_name(tmp_path):
     ("a: 1\n  b: 2\n", "line 2: is no YAML"), ("[" * 4_000, "is no YAML"), ("- " * 4_000, "is no YAML"),
     ("image: {a: b}\nresolution: 1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 1\nfree_thresh: 0", "image is {}"),
     ("image: a.pgm\nimage: b.pgm", "image is there twice"), ("x: 1\n" * 10_000, "is larger than"),
+    ("image: a.pgm\nresolution: 1\norigin: [0, 0, 90]\nnegate: 0\noccupied_thresh: 1\nfree_thresh: 0",
+     "the yaw of origin is 90 rad, more than a full turn. Convert it to radians"),
     ("image: ''\nresolution: 1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 1\nfree_thresh: 0", "image is ''"),
 ])  # fmt: skip
 def test_a_file_that_is_no_map_is_refused_in_one_line(tmp_path, text, message):

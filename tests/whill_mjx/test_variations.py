@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
-from whill_mjx.learning.setup import find_preset, variations_of
+from whill_mjx.learning.setup import find_preset, make_training_env, variations_of
 from whill_mjx.vehicle.presets import preset
 from whill_mjx.vehicle.vehicle_file import save_vehicle
 from whill_mjx.world.randomize import Variation, read_variation, vary_params
@@ -44,6 +46,19 @@ def test_an_interval_of_a_file_that_no_vehicle_can_have_is_refused(tmp_path, int
     path = save_vehicle(tmp_path / "vehicle.toml", spec, params, {"body.mass": interval})
     with pytest.raises(ValueError, match=r"vehicle.toml: body.mass.interval: body.mass is -.*; it must be positive"):
         variations_of(["fit"], path)
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    ("command_delay.delay=0.5x:2x", "the vehicle lacks command_delay, so a factor changes nothing. Give values"),
+    ("body.mass=0.9x:1.1x", None), ("command_delay.delay=0.1:0.2", None),
+])  # fmt: skip
+def test_a_factor_on_what_a_vehicle_lacks_is_refused(text, said):
+    task = dataclasses.replace(find_preset("smoke", "corridor"), vary=(text,), instances=2)
+    if said is None:
+        make_training_env(task, "whill_cr_ramp")
+        return
+    with pytest.raises(ValueError, match=said):
+        make_training_env(task, "whill_cr_ramp")
 
 
 @pytest.mark.parametrize(("text", "said"), [

@@ -68,7 +68,22 @@ def check_effect(kind: Any, where: str = "") -> type[Effect]:
     if unknown:
         raise ValueError(f"effect {kind.name!r} has no parameter {unknown[0]!r} (known: {', '.join(about)}). Correct "
                          "its card or its usual values.")
+    for field, one in about.items():
+        _check_range(f"effect {kind.name!r}: the range of {field}", (one.low, one.high))
+    for field, usual in kind.typical.items():
+        _check_range(f"effect {kind.name!r}: the usual values of {field}", usual)
     return kind
+
+
+def _check_range(what: str, ends: Any) -> None:
+    """Raise ValueError unless these are a lower and an upper number, finite."""
+    try:
+        low, high = ends
+        right = isinstance(low + high, (int, float)) and np.isfinite([low, high]).all() and low <= high
+    except (TypeError, ValueError):
+        right = False
+    if not right:
+        raise ValueError(f"{what} must be two finite numbers, the lower one first; got {ends!r}. Correct its class.")
 
 
 def all_effects() -> Registry[type[Effect]]:

@@ -19,6 +19,9 @@ def with_effects(params: VehicleParams, texts: Sequence[str]) -> VehicleParams:
     effects = list(params.effects)
     for text in texts:
         name, values = parse_effect(text)
+        if not (values or EFFECTS[name].typical):
+            raise ValueError(f"effect {text!r}: {name} has no usual values, so it would do nothing. Give some, as "
+                             f"{name}:{next(iter(known_parameters(name)))}=VALUE.")
         new = make_effect(name, **(values or {key: high for key, (_, high) in EFFECTS[name].typical.items()}))
         index = next((i for i, effect in enumerate(effects) if effect.name == name), None)
         if index is None:

@@ -22,6 +22,7 @@ from whill_mjx.io.heartbeat import say
 from whill_mjx.tasks.check import check_world
 from whill_mjx.tasks.options import named_task, read_fields
 from whill_mjx.tasks.tasks import Task, make_task
+from whill_mjx.world.randomize import check_factor
 
 SCRIPTED = ("planner", "random")
 NAME = re.compile("[A-Za-z0-9_-]{1,60}")
@@ -70,6 +71,10 @@ def make_plan(options: EvaluateOptions) -> Plan:
     for axis in (axis for axes in plan.sweeps for axis in axes if axis.name == "vehicle"):
         for vehicle in axis.values:
             plan.course(vehicle)
+    for text in options.sweep:
+        for axis in parse_sweep(text) if text != "standard" else ():
+            if axis.relative:
+                check_factor(f"--sweep {text}", plan.course().params, axis.name)
     return plan
 
 
@@ -89,7 +94,11 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],
                     "action_repeat": policy.action_repeat}
-    changes |= read_fields(task, options.set)
+    chosen = read_fields(task, options.set)
+    if policy and chosen.get("action_repeat", policy.action_repeat) != policy.action_repeat:
+        raise ValueError(f"--set action_repeat={chosen['action_repeat']}: {policy.path} holds each decision for "
+                         f"{policy.action_repeat} control periods, as in its training. Leave the option out.")
+    changes |= chosen
     if options.layout is not None:
         changes["layout"] = options.layout
     return make_task(name, **changes)

@@ -412,12 +412,14 @@ MAP = (
 )
 """YAML file of a map, as map_server reads it."""
 
+REPEATS = 100
+"""Control periods that a decision holds at most, as a policy file has it."""
 TASK = (
     Field("v_min", "m/s", -SPEED, SPEED),
     Field("v_max", "m/s", -SPEED, SPEED),
     Field("omega_max", "rad/s", 0.0, SPEED),
     Field("max_steps", kind="whole", low=1, high=10**7),
-    Field("action_repeat", kind="whole", low=1, high=10**4),
+    Field("action_repeat", kind="whole", low=1, high=REPEATS),
     Field("goal_radius", "m", 0.0, 1e3),
     Field("goal_reward", "-", -1e9, 1e9),
     Field("collision_reward", "-", -1e9, 1e9),

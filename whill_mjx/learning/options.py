@@ -11,6 +11,7 @@ import jax
 
 from dreamer.config import LEAST_TRAIN_RATIO, DreamerConfig
 from whill_mjx.io.command_line import COUNT, NOT_NEGATIVE, SEED, SHARE, OptionError, Range, With, check_known
+from whill_mjx.io.fields import REPEATS
 from whill_mjx.learning.setup import TRUTH, Preset, find_preset, with_layout, with_repeat, with_settings
 from whill_mjx.learning.shaping import SAFETY, find_safety
 from whill_mjx.tasks.options import named_task, read_fields
@@ -64,7 +65,7 @@ class TrainOptions:
     """Replayed steps per environment step; none takes the preset's."""
     change: tuple[str, ...] = ()
     """Other settings of the learner, such as greedy_share=0.25 entropy_scale=3e-4."""
-    action_repeat: Annotated[int | None, COUNT] = None
+    action_repeat: Annotated[int | None, Range(1, REPEATS)] = None
     """Control periods (0.1 s) that a decision holds; the budget in control periods, the updates and the horizon in
     seconds stay the preset's. None takes the preset's."""
     targets: Annotated[bool, MODEL] = False

@@ -32,7 +32,7 @@ from whill_mjx.tasks.tasks import Budget, Task, make_task
 from whill_mjx.vehicle.types import TimeStep
 from whill_mjx.vehicle.vehicle_file import load_intervals
 from whill_mjx.world.people.crowd import People
-from whill_mjx.world.randomize import Variation, check_parameter, read_variation
+from whill_mjx.world.randomize import Variation, check_factor, check_parameter, read_variation
 
 PAINTS = 15
 """Worlds of other looks that the mirror shows at most; any number could be drawn, but each takes memory."""
@@ -457,6 +457,9 @@ def make_training_env(preset: Preset, vehicle: str | Path | None, devices: tuple
     """A preset's chairs, of a vehicle file or built-in vehicle, as it trains them; split over `devices`."""
     env, params = make_env(preset.task, vehicle, exploring_starts=preset.exploring_starts, looks=preset.looks)
     variations = variations_of(preset.vary, vehicle)
+    for one in variations:
+        if one.relative:
+            check_factor(f"vary {one.name}={one.low:g}x:{one.high:g}x", params, one.name)
     return make_batch(env, params, preset.instances, preset.spread, devices, preset.second_tries, variations)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from whill_mjx.effects import EFFECTS, make_effect
 from whill_mjx.io.fields import Field, check, parameter_field
@@ -76,6 +77,16 @@ def check_parameter(where: str, name: str, values: Iterable[float], relative: bo
                else parameter_field(name, about.unit, about.low, about.high, about.neutral))
     for value in values:
         check(where, allowed, value)
+
+
+def check_factor(where: str, params: VehicleParams, name: str) -> None:
+    """Raise ValueError where a factor on a parameter of a vehicle, or of the effect that it lacks, changes nothing."""
+    holder, _, field = name.partition(".")
+    mine = next((effect for effect in params.effects if effect.name == holder), None)
+    owner = params.body if holder == "body" else mine or make_effect(holder)
+    if not np.any(np.asarray(getattr(owner, field))):
+        why = f"lacks {holder}" if holder != "body" and mine is None else f"has {name} = 0"
+        raise ValueError(f"{where}: the vehicle {why}, so a factor changes nothing. Give values without an x.")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ NAV2 = (".yaml", ".yml")
 """Endings of nav2 maps."""
 YAML_BYTES = MB // 100  # a map file has 0.2 kB
 REAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+FULL_TURN = 6.2832  # rad
 LEVELS = np.array([254, 128, 0], np.uint8)
 """Grey levels that stand for FREE, UNKNOWN and OCCUPIED where a map is written."""
 TRUE, FALSE = ("true", "yes", "on", "y"), ("false", "no", "off", "n")
@@ -45,13 +46,15 @@ def load_map(path: str | Path) -> GridMap:
             f"{path}: free_thresh is {free:g} and occupied_thresh {occupied:g}; the first must be less. "
             "Correct the file."
         )
+    x, y, yaw = table["origin"]
+    if abs(yaw) > FULL_TURN:
+        raise ValueError(f"{path}: the yaw of origin is {yaw:g} rad, more than a full turn. Convert it to radians.")
     mode = table.get("mode", "trinary")
     levels, alpha = read_levels(path.parent / table["image"])
     occupancy = level_occupancy(mode, occupied, free, bool(table["negate"]))[levels]
     if alpha is not None and mode != "raw":
         occupancy[alpha < 255] = -1
     kinds = occupancy_kinds(occupied, free, raw=mode == "raw")
-    x, y, yaw = table["origin"]
     occupancy = occupancy[::-1].copy()  # the last row of the image lies at the bottom
     remedy = "Check the resolution and the thresholds."
     return GridMap(kinds[occupancy], table["resolution"], (x, y, yaw), occupancy, remedy=remedy).brought_near()
