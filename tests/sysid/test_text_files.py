@@ -760,6 +760,8 @@ def test_two_clocks_in_one_file_are_refused_unless_they_are_the_same(tmp_path, l
         return
     with pytest.raises(ValueError, match="drive/cmd_time and drive/odom_time are times of different streams.*own"):
         convert(ConvertConfig(source=path, out=tmp_path / "log"))
+    convert(ConvertConfig(source=path, out=tmp_path / "log", columns=("time=drive/cmd_time:s",)))
+    check(load_log(tmp_path / "log").trials[0])
 
 
 @pytest.mark.parametrize("minus", ["\u2212", "\u2013", "()"])

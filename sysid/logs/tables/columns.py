@@ -39,8 +39,8 @@ SPELLED = {
     "km h": "km/h", "mm s": "mm/s", "cm s": "cm/s", "rad s": "rad/s", "deg s": "deg/s", "°": "deg", "°/s": "deg/s",
     "feet": "ft", "foot": "ft", "feet/s": "ft/s", "fps": "ft/s", "feet/min": "ft/min", "inch": "in", "inches": "in",
     "inches/s": "in/s", "yard": "yd", "yards": "yd", "knot": "kn", "knots": "kn", "kt": "kn", "kts": "kn",
-    "mi/h": "mph", "miles/h": "mph", "meters/s": "m/s", "metres/s": "m/s", "gons": "gon", "grad": "gon",
-    "grads": "gon", "grad/s": "gon/s", "turn": "rev", "turns": "rev", "revs": "rev", "rps": "rev/s",
+    "mi/h": "mph", "miles/h": "mph", "meters/s": "m/s", "metres/s": "m/s", "gons": "gon", "turn": "rev",
+    "turns": "rev", "revs": "rev", "rps": "rev/s",
     "rev/min": "rpm", "r/min": "rpm", "u/min": "rpm", "1/min": "rpm", "radians/s": "rad/s", "degrees/s": "deg/s",
 }
 PER_TURN = re.compile(r"(\d+(?:\.\d+)?)/rev")  # A unit of ticks: so many in a turn

@@ -211,6 +211,8 @@ def _of_no_unit(columns: Sequence[Column]) -> str:
 def _of_two_clocks(tables: Sequence[Table], columns: Sequence[Column]) -> str:
     """A sentence on two columns of a file that are the times of two streams, and differ: a file has one time."""
     for table in tables:
+        if any(one.role == "time" and one.file == table.stem and not one.guessed for one in columns):
+            continue  # somebody said which one counts
         used = STREAM_WORDS.keys() & {one.role.partition(".")[0] for one in columns if one.file == table.stem}
         clocks: dict[str, str] = {}  # by stream
         for name in table.columns:
@@ -223,7 +225,8 @@ def _of_two_clocks(tables: Sequence[Table], columns: Sequence[Column]) -> str:
             step = float(np.nanmedian(np.abs(np.diff(first))))
             if not np.allclose(first, second, rtol=0.0, atol=SAME * step, equal_nan=True):
                 return (f"{table.stem}/{one} and {table.stem}/{other} are times of different streams, and they differ, "
-                        "while a file has one time. Write each stream with its time to a file of its own.")
+                        "while a file has one time. Write each stream with its time to a file of its own, or say which "
+                        f"counts: time={table.stem}/{one}.")
     return ""
 
 

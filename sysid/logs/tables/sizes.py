@@ -51,8 +51,8 @@ def with_time_unit(column: Column, values: np.ndarray) -> Column:
     able = [unit for unit in ("s", "ms", "us", "ns") if quickest * UNITS["time"][unit] > FASTEST_STEP
             and (unit == "s" or span * UNITS["time"][unit] >= SHORTEST)]
     usual = [unit for unit in able if step * UNITS["time"][unit] < SLOWEST_STEP]
-    clear = len(usual or able) == 1 or "s" in usual and DATES[0] < first < DATES[1]
-    clear &= span >= SHORTEST or step >= RAPID
+    since = "s" in usual and DATES[0] < first < DATES[1]
+    clear = since or len(usual or able) == 1 and (span >= SHORTEST or step >= RAPID)
     return replace(column, unit=(usual or able or ["s"])[0], why=f"it steps by {step:.3g}", sure=column.sure and clear)
 
 
@@ -196,10 +196,10 @@ class _Known:
     def heading(self, stream: str) -> Signal | None:
         """Times [s] and heading [rad] of a pose, without jumps."""
         parts = {one: part for one in ("qw", "qx", "qy", "qz") if (part := self.signal(f"{stream}.{one}"))}
-        if {"qw", "qz"} <= set(parts):
-            parts = dict(zip(parts, _together(*parts.values()), strict=True))
-            t, w = parts["qw"]
-            x, y, z = (parts[one][1] if one in parts else np.zeros(len(t)) for one in ("qx", "qy", "qz"))
+        together = dict(zip(parts, _together(*parts.values()), strict=True)) if {"qw", "qz"} <= set(parts) else {}
+        if together and together["qw"] is not None:
+            t, w = together["qw"]
+            x, y, z = (together[one][1] if one in together else np.zeros(len(t)) for one in ("qx", "qy", "qz"))
             return t, np.unwrap(yaw_of(w, x, y, z))
         yaw = self.signal(f"{stream}.yaw")
         return (yaw[0], np.unwrap(yaw[1])) if yaw else None
