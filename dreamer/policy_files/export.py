@@ -92,7 +92,8 @@ class PolicyContract:
                              f"{self.action_high} in each component. Swap them.")
         if not (self.rate_hz > 0 and 1 <= self.action_repeat <= 100 and self.height >= 1 and self.width >= 1):
             raise ValueError(f"PolicyContract: rate_hz = {self.rate_hz}, action_repeat = {self.action_repeat}, image "
-                             f"{self.height} x {self.width} must all be positive. Correct the contract.")
+                             f"{self.height} x {self.width} must all be positive, and action_repeat at most 100. "
+                             "Correct the contract.")
 
 
 def export_policy(

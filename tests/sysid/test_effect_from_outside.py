@@ -20,6 +20,7 @@ from sysid.follow_up.next_manoeuvre import sensor_for
 from sysid.logs.log import load_log
 from sysid.missing.catalogue import falsifiers, hypotheses
 from sysid.pages.loop_report import make_report, write_run
+from sysid.replay.models import with_effects
 from sysid.replay.rollout import vehicle_plant
 from sysid.search.fitting import fit_log
 from sysid.search.settings import FitConfig
@@ -153,7 +154,7 @@ def test_a_class_that_is_no_complete_effect_is_refused(registered):
 
 def test_it_is_randomised_in_a_batch_of_environments(registered):
     env, params = make_env(ObstacleCourse(max_steps=3), height=16, width=16)
-    params = set_values(texts.with_effects(params, ["heading_drift"]), [RATE], np.array([PLANTED]))
+    params = set_values(with_effects(params, ["heading_drift"]), [RATE], np.array([PLANTED]))
     batch = make_batch(env, params, 4, spread=0.2)
     state, _ = jax.jit(batch.reset)(jax.random.key(0))
     rates = np.asarray(state.params.effects[-1].rate)
