@@ -12,10 +12,14 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import marker_seeker
 import numpy as np
 import pytest
 
 from whill_mjx.env import make_env, reset, reset_state, step, step_state, view_of
+from whill_mjx.evaluation.options import EvaluateOptions
+from whill_mjx.evaluation.policies.policy_file import load_policy
+from whill_mjx.evaluation.preparation import choose_task
 from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.registry import Registry
 from whill_mjx.learning.setup import find_preset
@@ -39,6 +43,20 @@ def file(tmp_path_factory):
     path = tmp_path_factory.mktemp("user") / "parking.py"
     path.write_text(text)
     return path
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("changed", [False, True])
+def test_an_evaluation_says_whether_the_task_is_that_of_the_training(file, tmp_path, capsys, changed):
+    name = f"{file}:Parking"
+    folder = marker_seeker.write(tmp_path / "policy", task=name)
+    task_file = "0" * 64 if changed else source_of(make_task(name))
+    note = {"identity": {"task_file": task_file}, "preset": {"task": {"bay_x": 2.5}}}
+    (tmp_path / "run.json").write_text(json.dumps(note))
+    assert choose_task(EvaluateOptions(str(folder)), load_policy(folder)).bay_x == 2.5
+    said = "".join(capsys.readouterr())
+    assert ("its file has changed since the training" in said) == changed
+    assert ("as in the training" in said) != changed
 
 
 @pytest.mark.quick

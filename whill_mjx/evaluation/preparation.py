@@ -14,7 +14,7 @@ from whill_mjx.evaluation.drivers import Driver, planner_driver, policy_driver, 
 from whill_mjx.evaluation.episodes import Course
 from whill_mjx.evaluation.options import EvaluateOptions
 from whill_mjx.evaluation.policies.policy_file import PolicyFile, load_policy
-from whill_mjx.evaluation.policies.policy_world import find_policy, trained_fields
+from whill_mjx.evaluation.policies.policy_world import find_policy, has_changed, trained_fields
 from whill_mjx.evaluation.sweeps import Axis, parse_sweep
 from whill_mjx.io.command_line import check_once
 from whill_mjx.io.folders import RUN_FILE
@@ -89,7 +89,10 @@ def choose_task(options: EvaluateOptions, policy: PolicyFile | None) -> Task:
     changes: dict[str, Any] = {}
     if policy and policy.task == name:
         changes = trained_fields(policy.path, name)
-        if changes:
+        if has_changed(policy.path, task):
+            say(f"task: {name}: its file has changed since the training ({policy.path.parent / RUN_FILE}), and the "
+                "policy may expect other observations. The task is evaluated as it is now")
+        elif changes:
             say(f"task: {name}, as in the training ({policy.path.parent / RUN_FILE})")
     if policy:
         changes |= {"v_min": policy.low[0], "v_max": policy.high[0], "omega_max": policy.high[1],

@@ -14,7 +14,7 @@ from whill_mjx.io.command_line import OptionError
 from whill_mjx.io.fields import PRESET, RUN, TASK, check, check_table
 from whill_mjx.io.folders import RUN_FILE
 from whill_mjx.io.reading import read_json
-from whill_mjx.tasks.tasks import find_task, make_task
+from whill_mjx.tasks.tasks import Task, find_task, make_task, source_of
 
 POLICY = "policy"
 """Folder of the policy within that of its training."""
@@ -102,6 +102,14 @@ def trained_fields(policy: Path, task: str) -> dict[str, Any]:
     known = {field.name for field in dataclasses.fields(find_task(task))}
     return {name: check(str(run), rows[name], value, f"preset.task.{name}") if name in rows else _hashable(value)
             for name, value in saved.items() if name in known}
+
+
+def has_changed(policy: Path, task: Task) -> bool:
+    """Whether a task's own file is another one than in the training of a policy, whose run.json lies beside it."""
+    run = policy.parent / RUN_FILE
+    identity = read_json(run, "missing.", "Train again.").get("identity") if run.is_file() else None
+    then = identity.get("task_file") if isinstance(identity, dict) else None
+    return then is not None and then != source_of(task)
 
 
 def _hashable(value: Any) -> Any:
