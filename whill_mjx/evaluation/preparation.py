@@ -59,7 +59,8 @@ def make_plan(options: EvaluateOptions) -> Plan:
     """Read and check everything that an evaluation needs before it drives or writes."""
     policy = None if options.policy in SCRIPTED else load_policy(find_policy(options.policy), options.runtime)
     task = choose_task(options, policy)
-    plan = Plan(options, task, policy, [parse_sweep(text) for text in _chosen_sweeps(options, task)])
+    texts = _chosen_sweeps(options, task)
+    plan = Plan(options, task, policy, [parse_sweep(text) for text in texts])
     pairs = [_named(text) for text in options.baselines]
     check_once("--baselines", [plan.main_name, *(name for name, _ in pairs)])
     if policy is None and {"blank", "freeze"} & set(options.blind):
@@ -71,9 +72,9 @@ def make_plan(options: EvaluateOptions) -> Plan:
     for axis in (axis for axes in plan.sweeps for axis in axes if axis.name == "vehicle"):
         for vehicle in axis.values:
             plan.course(vehicle)
-    for text in options.sweep:
-        for axis in parse_sweep(text) if text != "standard" else ():
-            if axis.relative:
+    for text, axes in zip(texts, plan.sweeps, strict=True):
+        for axis in axes:
+            if axis.relative and text in options.sweep:  # a task's own sweeps are for any vehicle
                 check_factor(f"--sweep {text}", plan.course().params, axis.name)
     return plan
 
